@@ -1,15 +1,22 @@
 """The guard: its rule on bandits whose success is known, and what it does to fine-tuning."""
 
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import tuners
-from tuners import METHODS, T, bits, equal, prior
+from tuners import METHODS, NET, TASK, T, bits, equal, prior
 
+from envs.types import Transition
+from sgft_jax.models import dynamics
+from sgft_jax.models.distortion import turned_and_scaled
+from sgft_jax.models.networks import make_dynamics
+from sgft_jax.models.system import told
 from sgft_jax.train import guard
+from sgft_jax.types import Batch, SimulatedData
 
 RUNS, ROLLOUTS = 4000, 20
 OBS = jnp.array([0.3, -0.8])
@@ -216,6 +223,91 @@ def test_a_challenger_that_proves_itself_becomes_the_reference_as_it_played(iden
         if metrics["guard/replaced"]:
             break
     assert equal(state.reference, played) and not equal(bare.fine.export(state.agent), played)
+
+
+TURN = turned_and_scaled(jnp.float32(0.6), jnp.log(jnp.array([0.7, 0.5])), jnp.array([0.1, 0.0]), jnp.zeros(2))
+WIND = jnp.array([0.8])  # the last entry of what `sysid` observes; no real system tells it
+
+
+def wander(obs, key):
+    return jax.random.uniform(key, (2,), minval=-1)
+
+
+def changed(name, obs, action):
+    """The next observation in the simulator, as the prior's models have it."""
+    params, first = prior().params, slice(1 if name == "guarded" else None)  # of the ensemble, as the methods ask it
+    models = jax.tree.map(lambda x: x[first], params.dynamics)
+    return dynamics.predict(make_dynamics(2, 2, NET), models, params.normalizer, obs, action).mean(0)
+
+
+def steps(name, key, n, choose, *, real):
+    """Rows of the simulator, or of a real system where commands are turned (`guarded`) or a wind blows (`sysid`)."""
+    key_obs, key_action = jax.random.split(key)
+    obs = jax.random.uniform(key_obs, (n, 2), minval=-1)
+    if name == "sysid" and real:
+        obs = obs.at[:, 1].set(0.0)
+    action = jax.vmap(choose)(obs, jax.random.split(key_action, n))
+    if not real:
+        after = jax.vmap(functools.partial(changed, name))(obs, action)
+    elif name == "guarded":
+        after = jax.vmap(lambda obs, action: changed(name, obs, TURN.meaning(action)))(obs, action)
+    else:
+        after = jax.vmap(lambda obs, action: changed(name, told(obs, WIND), action))(obs, action).at[:, 1].set(0.0)
+    return Transition(obs, action, -jnp.linalg.norm(after, axis=1), jnp.full(n, 0.9), after)
+
+
+@functools.cache
+def identifying(name):
+    """Functions of the method behind a guard: init(), export(state), learned(state), act(params, obs) and
+    rollout(state, key, score) -> (state, metrics), which plays what is deployed, observes and learns.
+    """
+    task = TASK if name == "guarded" else TASK._replace(measured_dim=1, sensor_errors=(0.0,))
+    room = {"replay_capacity": 64} if name == "guarded" else {"rows": 64}
+    fine, bare = (tuners.build(name, task, guard=flag, **room) for flag in (True, False))
+    data = SimulatedData(lambda key, n: Batch(*steps(name, key, n, wander, real=False)), jnp.zeros(1))
+
+    def rollout(state, key, score):
+        def act(obs, key):
+            return fine.act(state, (), obs, key, explore=jnp.bool_(True))[0]
+
+        state = fine.observe(state, steps(name, key, T, act, real=True), jnp.ones(T, bool), score)
+        return fine.learn(state, key, 2, data)
+
+    def deployed(params, obs):
+        return fine.policy.act(params, (), obs, jax.random.key(0), explore=jnp.bool_(False))[0]
+
+    start = functools.partial(jax.jit(lambda params: fine.init(params, jax.random.key(0), data)), prior().params)
+    return SimpleNamespace(
+        init=start,
+        export=fine.export,
+        learned=lambda state: bare.export(state.agent),
+        act=jax.jit(deployed),
+        rollout=jax.jit(rollout),
+    )
+
+
+@pytest.mark.parametrize("name", ["guarded", "sysid"])
+@pytest.mark.parametrize("right", ["identified", "simulator's"])
+def test_the_guard_judges_what_identification_makes_of_the_policy(name, right):
+    """Rollouts succeed with the policy that knows the system, or with the simulator's. Either ends up deployed."""
+    fine, params = identifying(name), prior().params
+    obs = OBS if name == "guarded" else OBS.at[1].set(0.0)
+    knowing = params._replace(**({"distortion": TURN} if name == "guarded" else {"system": WIND}))
+    ways = np.stack([fine.act(policy, obs) for policy in (params, knowing)])
+    assert np.linalg.norm(ways[0] - ways[1]) > 0.2
+    state, scores, flags = fine.init(), [], []
+    for key in jax.random.split(jax.random.key(1), 4):
+        deployed = np.asarray(fine.act(fine.export(state), obs))
+        nearest = np.argmin(np.linalg.norm(ways - deployed, axis=1))
+        scores.append(float(nearest == (right == "identified")))
+        state, metrics = fine.rollout(state, key, jnp.float32(scores[-1]))
+        flags.append((int(metrics["guard/challenger"]), int(metrics["guard/replaced"])))
+    np.testing.assert_allclose(fine.act(fine.learned(state), obs), ways[1], atol=0.05)
+    if right == "identified":
+        assert scores == [0, 1, 1, 1] and flags[:3] == [(1, 0), (1, 0), (0, 1)]
+    else:
+        assert scores == [1] * 4 and flags == [(0, 0)] * 4
+        assert equal(fine.export(state), fine.export(fine.init()))
 
 
 @pytest.mark.heavy
