@@ -9,6 +9,7 @@ in one program.
 `python -m experiments.compare hybrid` compares methods that learn from real data and a simulator, see its --help.
 """
 
+import difflib
 import glob
 import itertools
 import sys
@@ -63,6 +64,8 @@ class CompareArgs(GridArgs):
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line; its first word may be `hybrid`."""
     words = list(sys.argv[1:] if argv is None else argv)
+    if words and difflib.get_close_matches(words[0], [HYBRID]) and words[0] != HYBRID:
+        cli.fail(unknown("compare", words[0], [HYBRID]))
     if words[:1] == [HYBRID]:
         cli.run_main(compare_hybrid, HybridGridArgs, _HYBRID_HELP, argv=words[1:], default=hybrid_defaults)
     else:

@@ -91,7 +91,7 @@ def _first_line(module: str) -> str:
 def _list_lines(tasks: dict[str, Any]) -> list[str]:
     rows = [("task", "what it is", "gaps")]
     rows += [(name, task["about"], ", ".join(task["gaps"]) or "none") for name, task in tasks.items()]
-    return [*columns(rows), "", "one of them in full: python -m experiments.tasks push"]
+    return [*columns(rows), "", cli.as_typed("one of them in full: python -m experiments.tasks push")]
 
 
 def _task_lines(facts: dict[str, Any]) -> list[str]:

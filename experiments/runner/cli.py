@@ -8,6 +8,7 @@ import io
 import itertools
 import logging
 import os
+import re
 import select
 import signal
 import sys
@@ -28,6 +29,7 @@ from tyro import _errors
 
 from envs.types import UserError, unknown
 from experiments.runner import progress
+from sgft_jax.io import runs
 
 Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object and nothing else.")]
 
@@ -189,8 +191,7 @@ def _end_now(number: int, words: str = "") -> NoReturn:
 
 def _farewell(number: int, config_type: type) -> str:
     """What is said of a command that a signal has ended."""
-    again = "; the same command with --resume continues from the last checkpoint, if there is one"
-    return f"\n{_SIGNALS[number]}{again if _has_resume(config_type) else ''}"
+    return "; ".join([f"\n{_SIGNALS[number]}", *(runs.outlook() if _has_resume(config_type) else ())])
 
 
 def _say(words: str) -> None:
@@ -247,7 +248,8 @@ def parse[T](
     words = list(sys.argv[1:] if argv is None else argv)
     with _errors.on_parse_error(lambda event: _refuse(event, words, config_type, default)):
         return cast(
-            T, tyro.cli(config_type, prog=_program(words), description=description, args=words, default=default)
+            T,
+            tyro.cli(config_type, prog=_program(words), description=as_typed(description), args=words, default=default),
         )
 
 
@@ -255,11 +257,16 @@ def _program(words: Sequence[str]) -> str | None:
     """What a user types before `words`: `sgft NAME` where that script was started; None for tyro's own guess."""
     if (spec := getattr(sys.modules["__main__"], "__spec__", None)) is None:
         return None
-    by_script = any(Path(word).stem == "sgft" for word in sys.orig_argv[1:3])  # the second one behind an option
-    command = f"sgft {spec.name.rpartition('.')[2]}" if by_script else f"python -m {spec.name}"
+    command = as_typed(f"python -m {spec.name}")
     before = len(sys.argv) - len(words)
     kind = sys.argv[1:before] if sys.argv[before:] == list(words) else []  # such as `hybrid` of `compare hybrid`
     return " ".join([command, *kind])
+
+
+def as_typed(text: str) -> str:
+    """The text with its commands as a user types them: `sgft NAME` where that script was started."""
+    by_script = any(Path(word).stem == "sgft" for word in sys.orig_argv[1:3])  # the second one behind an option
+    return re.sub(r"python -m experiments\.(?!studies\b)", "sgft ", text) if by_script else text
 
 
 def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
@@ -345,7 +352,7 @@ def option_names(config_type: type, default: Any = None, *, prefix: str = "--") 
 
 def fail(message: str) -> NoReturn:
     """End the process as every user error does."""
-    print(f"error: {message}", file=sys.stderr)
+    print(f"error: {as_typed(message)}", file=sys.stderr)
     sys.exit(USER_ERROR)
 
 

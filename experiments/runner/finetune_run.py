@@ -333,7 +333,7 @@ class _Run(Training):
                 play = functools.partial(lambda first: [member(x, first) for x in films()], i * self.count)
                 print(before_and_after(record.env, pool, play, path, rollouts=rollouts))
             print(f"results: {record.folder}  (policy/, best/, real/, summary.json, figures/)")
-        print(f"next: python -m experiments.figures --out {self.args.out}")
+        print(cli.as_typed(f"next: python -m experiments.figures --out {self.args.out}"))
         return summaries
 
     def _before_and_after(self, progress: FinetuneProgress) -> list[Episode]:

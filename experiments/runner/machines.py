@@ -83,14 +83,14 @@ def reserve(
     """
     share = {name: copies * size / devices for name, size in parts.items()}
     need, room = sum(share.values()) + shared, free_memory()
-    free = "" if room is None else f" of {_gib(room)} free"
+    free = "" if room is None else f", {_gib(room)} free"
     data = {"data": shared} if shared else {}
     listed = ", ".join(f"{name} {_gib(size)}" for name, size in (share | data).items())
-    print(f"memory: {_gib(need)}{free} on each device ({listed})")
+    print(f"memory: {_gib(need)} needed on each device{free} ({listed})")
     if room is not None and need > room:
         option = max(share, key=share.__getitem__).replace("_", "-")
         raise UserError(
-            f"experience and batches take {_gib(need)}{free} on each device: lower --{settings}.{option} or train fewer"
+            f"experience and batches take {_gib(need)} on each device{free}: lower --{settings}.{option} or train fewer"
         )
 
 

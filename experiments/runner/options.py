@@ -36,7 +36,7 @@ Impl = Annotated[
 
 Task = Annotated[
     str,
-    arg(help="A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."),
+    arg(help="A task by name (the command `tasks` lists them), or a Python file with a task of your own."),
 ]
 Out = Annotated[Path, arg(help="Parent of all run folders.")]
 FirstSeed = Annotated[int, arg(help="Expert: first seed.")]

@@ -20,6 +20,7 @@ from envs.gaps import SIM, Gap
 from envs.observations import blurred, varying, with_system
 from envs.rollout import Episode, heldout_worlds, load_gap, real_env, training_worlds
 from envs.types import PyTree
+from experiments.runner.cli import as_typed
 from experiments.runner.machines import folder_of_host, join_hosts, reserve
 from experiments.runner.pictures import film_episode
 from experiments.runner.progress import doing
@@ -266,4 +267,4 @@ class _Run(Training):
         method = "" if methods[0] == DEFAULT else f" --method {methods[0]}"
         method += "" if self.gap is None else f" --real {SIM}"
         out = "" if self.args.out == type(self.args).out else f" --out {self.args.out}"
-        print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {folder}{out}")
+        print(as_typed(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {folder}{out}"))

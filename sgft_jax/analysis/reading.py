@@ -38,6 +38,8 @@ def read_curve(folder: Path) -> Curve:
     Their folders are finetune/<task>/<gap>/<method>[_<variant>]/<seeds> and
     hybrid/<task>/<simulator>/<data>/<method>[_<preset>]/<seeds>.
     """
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder")
     records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")

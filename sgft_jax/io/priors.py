@@ -148,10 +148,17 @@ def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
 
 
 def _home(folder: str | Path) -> Path:
-    """The folder itself, or the prior inside a run folder."""
-    folder = resolve_shipped(folder)
-    home, inside = present(folder), present(folder / "prior")
-    return inside if not (home / CARD).exists() and (inside / CARD).exists() else home
+    """The folder itself, or the prior inside a run folder. Raises UserError for a folder of several, and for none."""
+    home, inside = present(resolve_shipped(folder)), present(resolve_shipped(folder) / "prior")
+    for place in (home, inside):
+        if (place / CARD).exists():
+            return place
+        if cards := sorted(set(place.glob(f"*/{CARD}")) - {inside / CARD}):
+            one = cards[0].parent.relative_to(home)
+            raise UserError(f"{folder}: holds priors, name one of them, such as {folder}/{one}")
+    if not home.exists():
+        raise UserError(f"{folder}: no such folder")
+    return home
 
 
 def digest(prior: Prior) -> str:

@@ -26,6 +26,7 @@ FORMAT = 3  # of run folders; a state saved by another format does not fit the c
 # What a start has to show for itself; one that has failed before any of it is there can be forgotten.
 _STEPS = ("checkpoints/[0-9]*", f"checkpoints/{ASIDE}[0-9]*")
 _RESULTS = (*_STEPS, "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")
+_OPEN: list[Path] = []  # the run folders in which this process works, or has been ended
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 NO_DATA, NO_SIMULATOR = "no-data", "no-simulator"  # what stands for them in the folders of runs without
 
@@ -95,7 +96,18 @@ def opened(
                 first = {_MARK: _version("sgft-jax"), "format": FORMAT, "kind": kind, "config": config}
                 write_json(folder / CONFIG, first)
             write_json(folder / PROVENANCE, {"starts": [*read_starts(folder), {**provenance(), **inputs}]})
+        _OPEN[:] = configs
         yield list(configs)
+        _OPEN.clear()
+
+
+def outlook() -> list[str]:
+    """What is worth saying to a user who ends the runs of this process; [] where none has begun."""
+    if not _OPEN:
+        return []
+    if all(map(_has_results, _OPEN)):
+        return ["the same command with --resume continues from what is saved"]
+    return ["nothing is saved yet, the same command begins again"]
 
 
 def provenance() -> dict[str, Any]:
@@ -166,11 +178,15 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
         stored = _stored(folder) if (folder / CONFIG).exists() else {}
         if _MARK not in stored:
             raise UserError(f"{folder}: is not a run folder (it has no {CONFIG} of ours); choose another one")
-        if not (resume or overwrite) and any(path for pattern in _RESULTS for path in folder.glob(pattern)):
+        if not (resume or overwrite) and _has_results(folder):
             raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
     elif resume and not folder.exists():
         raise UserError(f"{folder}: nothing to resume there; leave --resume out to start it")
     return existing
+
+
+def _has_results(folder: Path) -> bool:
+    return any(path for pattern in _RESULTS for path in folder.glob(pattern))
 
 
 def check_folder(folder: Path, option: str = "--out") -> None:

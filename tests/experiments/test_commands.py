@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from experiments import __main__ as commands
+from experiments.runner import cli
 
 
 def test_the_list_names_every_command_in_a_line(capsys):
@@ -33,12 +34,24 @@ def test_a_command_gets_the_words_that_follow(capsys, monkeypatch):
     assert stopped.value.code == 2 and "task: there is no 'nope'" in capsys.readouterr().err
 
 
+SCRIPT, MODULE = ["python", "/usr/bin/sgft", "tasks"], ["python", "-m", "experiments", "tasks"]
+
+
+@pytest.mark.parametrize(("line", "words"), [(SCRIPT, "sgft figures"), (MODULE, "python -m experiments.figures")])
+def test_commands_in_hints_are_what_the_user_types(line, words, capsys, monkeypatch):
+    monkeypatch.setattr("sys.orig_argv", line)
+    assert cli.as_typed("next: python -m experiments.figures --out a") == f"next: {words} --out a"
+    assert (
+        cli.as_typed("python -m experiments.studies.tune") == "python -m experiments.studies.tune"
+    )  # no script has it
+    with pytest.raises(SystemExit):
+        cli.fail("make one with: python -m experiments.figures")
+    assert capsys.readouterr().err == f"error: make one with: {words}\n"
+
+
 @pytest.mark.parametrize(
     ("line", "shown"),
-    [
-        (["python", "/usr/bin/sgft", "tasks", "--help"], "usage: sgft tasks "),
-        (["python", "-m", "experiments", "tasks", "--help"], "usage: python -m experiments.tasks "),
-    ],
+    [([*SCRIPT, "--help"], "usage: sgft tasks "), ([*MODULE, "--help"], "usage: python -m experiments.tasks ")],
 )
 def test_the_usage_is_what_was_typed(line, shown, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["sgft"])

@@ -100,11 +100,12 @@ def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):
     monkeypatch.setattr(machines, "free_memory", lambda: 5 * 2**30)
     reserve(parts, copies=2, devices=2)  # 4 GiB each
     assert capsys.readouterr().out == (
-        "memory: 4.00 GiB of 5.00 GiB free on each device (random_transitions 1.00 GiB, replay_capacity 3.00 GiB)\n"
+        "memory: 4.00 GiB needed on each device, 5.00 GiB free "
+        "(random_transitions 1.00 GiB, replay_capacity 3.00 GiB)\n"
     )
-    with pytest.raises(UserError, match=r"8\.00 GiB of 5\.00 GiB free on each device: lower --config\.replay-capacity"):
+    with pytest.raises(UserError, match=r"8\.00 GiB on each device, 5\.00 GiB free: lower --config\.replay-capacity"):
         reserve(parts, copies=2)
-    with pytest.raises(UserError, match=r"7\.00 GiB of 5\.00 GiB free on each device: lower --schedule\.buffer"):
+    with pytest.raises(UserError, match=r"7\.00 GiB on each device, 5\.00 GiB free: lower --schedule\.buffer"):
         reserve({"buffer": 2**31}, copies=3, shared=2**30, settings="schedule")  # what is shared counts once
     assert "(buffer 6.00 GiB, data 1.00 GiB)" in capsys.readouterr().out
     monkeypatch.setattr(machines, "free_memory", lambda: None)

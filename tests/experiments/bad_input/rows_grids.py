@@ -1,6 +1,8 @@
 """What grids of runs, their tables, and measurements of gaps cannot use."""
 
 ROWS = [
+    ("compare hybird", "compare: there is no 'hybird', did you mean 'hybrid'?"),
+    ("compare push", "unexpected word 'push' on the command line"),
     ("compare --tasks nope", "task: there is no 'nope'"),
     ("compare --tasks", "--tasks: name at least one"),
     ("compare --tasks push push", "--tasks names push twice"),

@@ -224,8 +224,10 @@ def test_runs_of_other_seeds_are_one_curve(tmp_path):
     assert found.seeds.tolist() == [3, 4, 7] and len(found.prior) == 3
     np.testing.assert_array_equal(found.values, [[0.3, 0.8], [0.4, 1.0], [0.2, 0.3]])
     assert "seed-5: left out" in note and "cannot be put together" in note
-    with pytest.raises(UserError, match="holds no evaluation yet"):
+    with pytest.raises(UserError, match=r"mbpo/seed-0: no such folder$"):
         read_curve(tmp_path / "finetune/toy/default/mbpo/seed-0")
+    with pytest.raises(UserError, match="holds no evaluation yet"):
+        read_curve(tmp_path)
 
 
 def test_a_flat_table_and_back():

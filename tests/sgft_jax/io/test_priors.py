@@ -325,6 +325,17 @@ def test_a_checkpoint_is_not_a_prior(tmp_path):
         priors.load_prior(tmp_path / "checkpoints" / "20")
 
 
+def test_where_no_prior_is_or_several_are_is_said(tmp_path):
+    with pytest.raises(UserError, match=r"shipped:push: holds priors, name one of them, such as shipped:push/seed-0$"):
+        priors.load_prior("shipped:push")
+    save(tmp_path / "run/prior/seed-3")
+    for folder, rest in ((tmp_path / "run", "prior/seed-3"), (tmp_path / "run/prior", "seed-3")):
+        with pytest.raises(UserError, match=f"{folder}: holds priors, name one of them, such as {folder}/{rest}$"):
+            priors.load_prior(folder)
+    with pytest.raises(UserError, match=r"gone: no such folder$"):
+        priors.load_prior(tmp_path / "gone")
+
+
 def test_a_prior_needs_its_card_and_plain_dicts(tmp_path):
     with pytest.raises(ValueError, match="act_dim"):
         priors.save_prior(tmp_path / "prior", Prior(make_prior().params, {"task": "hammer", "obs_dim": 4}))

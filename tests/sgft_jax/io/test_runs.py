@@ -145,6 +145,21 @@ def test_of_several_runs_all_open_or_none(tmp_path):
     assert len(starts_of(new)) == len(starts_of(old)) == 1
 
 
+@pytest.mark.parametrize(("begun", "words"), [("y", "nothing is saved yet"), ("xy", "with --resume continues")])
+def test_who_ends_a_run_hears_whether_it_can_go_on(tmp_path, begun, words):
+    """Of several runs all have to."""
+    together = opened({tmp_path / name: {} for name in "xy"}, kind="pretrain", say=lambda _: None)
+    assert runs.outlook() == []
+    with pytest.raises(KeyboardInterrupt), together:
+        for name in begun:
+            leave_a_checkpoint(tmp_path / name)
+        raise KeyboardInterrupt
+    assert words in runs.outlook()[0]
+    with opened({tmp_path / "x": {}}, kind="pretrain", resume=len(begun) > 1, say=lambda _: None):
+        pass  # as it was said
+    assert runs.outlook() == []
+
+
 def test_a_run_goes_on_with_the_inputs_that_it_began_with(tmp_path):
     given = {tmp_path / "x": {"task": "hammer"}}
 
