@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.runner.options import Impl, at_least_one, check_task, each_once, prior_folders, task_of_priors
+from experiments.runner.progress import doing
 from sgft_jax.io.log import write_summary
 from sgft_jax.io.runs import check_folder, provenance
 from sgft_jax.models.config import Precision
@@ -144,7 +145,8 @@ def _lines(kind: _Kind, config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     function = getattr(importlib.import_module(f"experiments.bench.{module}"), name)
     options = {option: getattr(config, option) for option in kind.options}
     for values in product(*(getattr(config, option) for option in kind.axes.values())):
-        measured = function(**dict(zip(kind.axes, values, strict=True)), **options)
+        with doing(f"measuring {kind.title}: {', '.join(map(str, values))}"):
+            measured = function(**dict(zip(kind.axes, values, strict=True)), **options)
         yield from measured if isinstance(measured, list) else [measured]
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.runner.options import prior_folders, task_of_priors
+from experiments.runner.progress import doing
 from sgft_jax.io.runs import check_folder
 
 
@@ -41,7 +42,8 @@ def main(args: ExportArgs) -> None:
     for folder, path in zip(folders, homes, strict=True):
         env = envs.make(task, **observed_by([folder]))
         prior = load_prior(folder, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim)
-        worst = save_exported(path, prior, env, args.to)
+        with doing(f"exporting to {args.to} and comparing actions"):
+            worst = save_exported(path, prior, env, args.to)
         print(f"{path}: actions differ from the policy's by {worst:.1e} at most")
 
 

@@ -60,12 +60,12 @@ def teach(args: "CollectArgs", level: float, files: Sequence[Path], kinds: Seque
     schedule = Schedule(args.updates, args.environments, buffer=room, chunk_updates=args.eval_every)
     pools = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), system.pools)
     keys, note = seed_keys(seeds, FromLog.COLLECTION), functools.partial(_note, agent)
-    steps = hybrid.train(env, agent, schedule, pools, hybrid.no_data(env), keys, gamma=config.gamma, note=note)
+    with doing("compiling the training", 30, once=True):
+        steps = hybrid.train(env, agent, schedule, pools, hybrid.no_data(env), keys, gamma=config.gamma, note=note)
+        next(steps)  # the start, which no updates are behind
     reached: dict[int, tuple[PyTree, Transition, Noted]] = {}
     with RunProgress(f"SAC on {env.name}", total=schedule.chunks * args.eval_every, unit="updates") as progress:
-        for state, metrics in steps:
-            if not metrics:
-                continue
+        for state, _ in steps:
             returns = _returns(args, agent, system, state)
             for i in np.flatnonzero(returns >= level).tolist():
                 reached.setdefault(i, _snapshot(agent, state, i))

@@ -147,9 +147,10 @@ def predicted(diagnosis: Mapping[str, Any]) -> dict[str, Any]:
 
 def _play(env: Env, reals: Sequence[Gap], priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
     """Exploring rollouts [n] of every prior on every gap: [gaps * priors], all priors on the first gap first."""
-    system, members = systems(env, reals, priors, max(n, 64))
-    key, policy = jax.random.fold_in(jax.random.key(_SEED), seed), make_policy(priors[0].card, system.env)
+    key = jax.random.fold_in(jax.random.key(_SEED), seed)
     with doing(f"playing {_rollouts(n)} of each prior", 30, once=True):
+        system, members = systems(env, reals, priors, max(n, 64))
+        policy = make_policy(priors[0].card, system.env)
         return _of_members(play(system, policy, members, key, n, explore=True), len(reals) * len(priors))
 
 

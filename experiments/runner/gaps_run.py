@@ -44,8 +44,8 @@ def run(args: "GapsArgs", seeds: list[int], folders: list[Path]) -> dict[str, An
     env = real_env(env, reals)
     folder = args.out / "gaps" / task
     priors = load_priors(folders, env)
-    system, members = systems(env, reals, priors, args.episodes)
     with doing(f"playing {args.episodes} episodes on each real system", 30, once=True):
+        system, members = systems(env, reals, priors, args.episodes)
         played = play(system, make_policy(priors[0].card, env), members, episode_key(FINAL_SEED), args.episodes)
     zero_shot = [stacking.part(played, i, len(priors)) for i in range(len(reals))]
 

@@ -17,6 +17,7 @@ from envs.gaps import SIM, Gap
 from envs.rollout import Episode, real_env, real_worlds
 from experiments.runner.machines import reserve
 from experiments.runner.pictures import film_episode
+from experiments.runner.progress import doing
 from experiments.runner.recorded import read_log
 from experiments.runner.training import Record, Training, opened, play, scores
 from sgft_jax.analysis import figures
@@ -50,7 +51,8 @@ def run(
     if method.kind != "simulator" and args.data is not None:
         log = read_log(args.data, env, gamma=args.options.gamma, successors=args.successors)
     inputs = {"data": None if log is None else {"sha256": log.facts.sha256, "successors": log.facts.successors}}
-    training = _Run(args, method, env, simulators, seeds, log)  # refuses what it cannot play before a folder is made
+    with doing("building the worlds", 5):
+        training = _Run(args, method, env, simulators, seeds, log)  # what it cannot play it refuses before any folder
     with opened("hybrid", args, homes, inputs) as folders:
         return training.work(folders)
 
@@ -109,7 +111,8 @@ class _Run(Training):
         restored = self.restore(lambda: hybrid.shape_of(env, agent, schedule, pools, self.real, keys))
         state = join([state for state, _ in restored]) if restored else None
         data, gamma = (self.pools, self.real, self.keys), self.args.options.gamma
-        steps = hybrid.train(env, agent, schedule, *data, gamma=gamma, state=state)
+        with self.announced(None):
+            steps = hybrid.train(env, agent, schedule, *data, gamma=gamma, state=state)
         return self._finish(self.follow(steps, 0 if state is None else self.done(state)))
 
     # ------------------------------------------------------------ between chunks

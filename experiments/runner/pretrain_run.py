@@ -106,7 +106,9 @@ class _Run(Training):
         for saved, meta in self.restore(lambda: jax.eval_shape(self._saved, self.shapes()[1])):
             (state, self.best), self.clock.seconds, done = saved, meta["seconds"], meta["env_steps"]
         data = {"pools": self.pools, "random": self._random()}
-        self.follow(pretraining.pretrain(self.env, self.config, self.seeds, state=state, **data), done)
+        with self.announced(None):
+            steps = pretraining.pretrain(self.env, self.config, self.seeds, state=state, **data)
+        self.follow(steps, done)
         assert self.best is not None  # evaluated before the first chunk
         summary = self._hand_over(self.best)
         self.record.log.close()
@@ -128,7 +130,7 @@ class _Run(Training):
         if checkpoint.latest(folder) is not None:
             return checkpoint.restore(folder, self.shapes()[0], expect=expect)[0]
         count = self.count * self.config.random_transitions
-        with self.clock("random"), doing(f"collecting {count:,} transitions under random actions"):
+        with self.clock("random"), doing(f"collecting {count:,} random transitions", 15 + count / 200_000, once=True):
             rows = pretraining.collect_random(self.env, self.config, self.seeds, self.pools(0))
             random = jax.block_until_ready(rows)
         checkpoint.save(folder, 0, mesh.local(random), meta=expect)
@@ -167,9 +169,9 @@ class _Run(Training):
         report = None
         with self.clock("report"):
             if self.args.report and self.policy.value:
-                with doing("measuring V_sim and the models", 30, once=True):
+                with doing("measuring V_sim and the models", 20, once=True):
                     report = self._report(best.params)
-            with doing("playing fresh episodes for the cards"):
+            with doing("playing fresh episodes for the cards", 5):
                 played = self._final_episodes(best.params)
         results = []
         for i, seed in enumerate(self.seeds):

@@ -109,7 +109,7 @@ class Training(abc.ABC):
                 values = {name: np.asarray(x) for name, x in metrics.items()}
                 shown = self.log(state, values, seconds) if values else {}
                 if self.evaluates(before, done, learned=bool(values)):
-                    with self.clock("evaluate"), doing("evaluating", 20, once=True):
+                    with self.clock("evaluate"), doing("evaluating", 15, once=True):
                         shown |= self.evaluate(state, done)
                 if self.checkpoints(before, done, learned=bool(values)):
                     with self.clock("checkpoint"), doing("writing a checkpoint"):
@@ -119,7 +119,7 @@ class Training(abc.ABC):
 
     def announced(self, before: Any) -> contextlib.AbstractContextManager[None]:
         """Says what the next step is, see `doing`. before: the state of the one before, None at the start."""
-        return doing("compiling the training", 40, once=True) if before is None else doing("training")
+        return doing("compiling the training", 30, once=True) if before is None else doing("training")
 
     def _timed(self, steps: Iterator[tuple[Any, Metrics]]) -> Iterator[tuple[Any, Metrics, float]]:
         """The same with the seconds that each took."""

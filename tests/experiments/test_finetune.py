@@ -214,7 +214,7 @@ def test_a_run_says_what_it_is_doing(home):
     assert (home / "sgft-sac.words").read_text().splitlines() == [
         "making the real systems (about 5 s)",
         "preparing the agents (about 10 s, once)",
-        "evaluating (about 20 s, once)",
+        "evaluating (about 15 s, once)",
         "the first rollout, for which play and updates are compiled (about 60 s, once)",
         "writing a checkpoint",
         "playing and learning",
