@@ -34,7 +34,7 @@ from sgft_jax.io import runs
 Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object and nothing else.")]
 
 BROKEN_PIPE, USER_ERROR = 1, 2
-_SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+_SIGNALS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
 _IN_ORDER: list[str] = []  # what must come to an end before the process does
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
@@ -78,7 +78,7 @@ def run_main[T](
                 main(config)
         except KeyboardInterrupt as stopped:
             number = getattr(stopped, "number", signal.SIGINT)
-            _say(_farewell(number, config_type))
+            progress.say(_farewell(number, config_type))
             sys.exit(128 + number)
         except UserError as error:
             fail(str(error))
@@ -168,8 +168,8 @@ def _end_in_time(pipe: int, asked: Sequence[int], heard: threading.Event, config
         if first is not None and not heard.wait(1.0):
             if not _IN_ORDER:
                 _end_now(first, _farewell(first, config_type))
-            waits = f"waiting for {_IN_ORDER[-1]} until this is done: {progress.phase() or 'working'}"
-            _say(f"\n{_SIGNALS[first]}: {waits}; a second signal ends the process at once")
+            waits = f"waiting for {_IN_ORDER[-1]} until this is done: {progress.phase()}"
+            progress.say(f"\n{_SIGNALS[first]}: {waits}; a second signal ends the process at once")
         if (second := next(numbers, None)) is not None:
             _end_now(second)
 
@@ -185,19 +185,13 @@ def _end_now(number: int, words: str = "") -> NoReturn:
     if (processes := sys.modules.get("multiprocessing")) is not None:
         for process in processes.active_children():
             process.kill()
-    _say(words or f"\n{_SIGNALS[number]}")
+    progress.say(words or f"\n{_SIGNALS[number]}")
     os._exit(128 + number)
 
 
 def _farewell(number: int, config_type: type) -> str:
     """What is said of a command that a signal has ended."""
     return "; ".join([f"\n{_SIGNALS[number]}", *(runs.outlook() if _has_resume(config_type) else ())])
-
-
-def _say(words: str) -> None:
-    """On stderr, unless the terminal has hung up."""
-    with contextlib.suppress(OSError):
-        print(words, file=sys.stderr, flush=True)
 
 
 class _Quiet:

@@ -40,18 +40,11 @@ class _Voice:
         self.bar: Progress | None = None
         self.silent = False
 
-    def say(self, line: str) -> None:
-        """A line on stderr; nothing fails for want of a reader."""
-        self.heard = time.monotonic()
-        if not self.silent:
-            with contextlib.suppress(OSError, ValueError):
-                print(line, file=sys.stderr, flush=True)
-
     def announce(self, words: str, usual: str) -> None:
         """Says what begins, the first time. usual: how long that takes, "" where nobody knows."""
         if words not in self.said:
             self.said.add(words)
-            self.say(f"{words} ({usual})" if usual else words)
+            say(f"{words} ({usual})" if usual else words)
 
     def still(self, start: _Phase, cpu: float) -> None:
         """What goes on is said again after some silence. start: what goes on before anything has been announced.
@@ -60,16 +53,12 @@ class _Voice:
         """
         phase, now = (self.phases or [start])[-1], time.monotonic()
         lasts = now - phase.begun
-        if not self.said:
-            if cpu > _FIRST or lasts > _AGAIN:
-                self.announce(start.words, "some seconds")
-        elif now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
+        if not self.said and (cpu > _FIRST or lasts > _AGAIN):
+            self.announce(start.words, "some seconds")
+        elif self.said and now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
             words = phase.words if self.phases or self.said == {start.words} else "working"  # between two phases
-            self.say(f"still {words} ({_duration(lasts)} so far{', compiling' if any(self.compiling()) else ''})")
-
-    def compiling(self) -> Iterator[int]:
-        """The threads that JAX compiles in."""
-        return (thread for thread, depth in tuple((self.depths or {}).items()) if depth)
+            compiling = ", compiling" if any((self.depths or {}).values()) else ""
+            say(f"still {words} ({_duration(lasts)} so far{compiling})")
 
     def listen(self) -> None:
         """Hears from JAX, once it is imported, when it compiles."""
@@ -91,15 +80,28 @@ class _Voice:
 _VOICE = _Voice()
 
 
+def say(line: str) -> None:
+    """A line on stderr; nothing fails for want of a reader."""
+    _VOICE.heard = time.monotonic()
+    if not _VOICE.silent:
+        with contextlib.suppress(OSError, ValueError):
+            print(line, file=sys.stderr, flush=True)
+
+
+def say_nothing() -> None:
+    """For a host that is not the first: it does the same as that one, which says so."""
+    _VOICE.silent = True
+
+
 @contextlib.contextmanager
 def doing(words: str, about: float | None = None, *, once: bool = False) -> Iterator[None]:
     """Says what happens in the `with` block: when that begins for the first time, and as `never_silent` does.
 
-    about: s that it takes on two cores. once: so long only the first time, because compiled programs are kept.
+    about: s that it takes on two cores. once: so long only the first time, because what it makes is kept.
     """
-    time_taken = "" if about is None else f"about {about:.0f} s" if about < 100 else f"about {about / 60:.0f} min"
+    usual = [] if about is None else [f"about {about:.0f} s" if about < 100 else f"about {about / 60:.0f} min"]
     _VOICE.listen()
-    _VOICE.announce(words, ", ".join(filter(None, [time_taken, "once" if once else ""])))
+    _VOICE.announce(words, ", ".join([*usual, "once"] if once else usual))
     _VOICE.phases.append(_Phase(words, time.monotonic()))
     try:
         yield
@@ -129,14 +131,9 @@ def never_silent() -> Iterator[None]:
         watcher.join()
 
 
-def say_nothing() -> None:
-    """For a host that is not the first: it does the same as that one, which says so."""
-    _VOICE.silent = True
-
-
 def phase() -> str:
-    """What happens now, "" where nothing has been announced."""
-    return _VOICE.phases[-1].words if _VOICE.phases else ""
+    """What happens now."""
+    return _VOICE.phases[-1].words if _VOICE.phases else "working"
 
 
 def leave_terminal() -> None:

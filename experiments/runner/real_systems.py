@@ -168,8 +168,8 @@ def connect(
     """
     from sgft_jax.systems.gymnasium import Gymnasium
 
+    cli.in_order("the robot" if is_robot(reals[0]) else "the environments")  # which may be robots too
     if is_robot(reals[0]):
-        cli.in_order("the robot")
         from sgft_jax.systems.remote import Remote
 
         if members > 1:

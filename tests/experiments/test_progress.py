@@ -111,6 +111,7 @@ def test_lines_come_more_and_more_seldom(capsys, monkeypatch):
     for name, seconds in {"_FIRST": 2.0, "_AGAIN": 10.0, "_SELDOM": 60.0}.items():
         monkeypatch.setattr(progress, name, seconds)
     voice, start, spoken = progress._Voice(), progress._Phase("starting", clock.now), []
+    monkeypatch.setattr(progress, "_VOICE", voice)
     for second in range(400):
         clock.now = 100.0 + second
         voice.still(start, cpu=second / 2)
