@@ -198,10 +198,18 @@ def test_soft_pushes_succeed(real):
 
 @pytest.mark.slow
 def test_mjx_steps_it_as_mujoco_does(real):
-    """From states of a push, one control period: 1 mm in what the learner sees, a few mm in what touches."""
+    """From states of a push, one control period.
+
+    MJX counts the couplings of a towel's dampers, which C MuJoCo leaves out (docs/physics.md): in 28 periods they were
+    1.1 mm apart on average and 5.5 at worst, in 12 without dampers 0.2 and 0.9.
+    """
     states = played(real, lambda obs: push_softly(WAYS[real.env.name], obs), steps=12)
     mjx = bench(envs.make(real.env.name, "jax", real.env.scene), real.worlds)
+    apart = []
     for before, after in zip(states[:-1:3], states[1::3], strict=False):
         action = push_softly(WAYS[real.env.name], before.true_obs)
         seen = mjx.step(member(real.worlds, 0), before, action, KEY)
-        np.testing.assert_allclose(seen.true_obs, after.true_obs, atol=1e-3)
+        apart.append(np.abs(seen.true_obs - after.true_obs))
+    worst, mean = {"towel": (8e-3, 2e-3), "ball": (1e-3, 1e-3)}[real.env.scene]  # m
+    assert np.max(apart) < worst and np.max(apart, axis=1).mean() < mean
+    assert np.max(apart, axis=0)[:2].max() < 1e-4  # the hand
