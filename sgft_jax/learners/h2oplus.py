@@ -165,13 +165,13 @@ def make_h2oplus(config: H2OPlusConfig, hyper: Any = None) -> Learner:
 
 def _step_value(nets: Networks, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
     """V after a step on the real rows alone, against the minimum of the target critics. Source: H2O+ Eq. (4)."""
-    q, hyper, counted = iql.lowest_target(nets, state, batch), state.hyper, losses.real_rows(batch)
+    q, hyper, counted = steps.lowest_target(nets, state, batch), state.hyper, losses.real_rows(batch)
     numbers = {"expectile": hyper.expectile, "alpha": hyper.value_alpha, "cut": hyper.value_cut}
 
     def row_losses(values: Array) -> Array:
         return losses.in_sample_loss(nets.config.value_loss, values, q, counted, **numbers)
 
-    return iql.step_value(nets, state, batch, row_losses, losses.real_mean)
+    return steps.step_value(nets, state, batch, row_losses, losses.real_mean)
 
 
 def _step_critic(

@@ -6,7 +6,6 @@ that expectiles and learning rates vmap like seeds do. Source: Kostrikov et al. 
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -181,9 +180,9 @@ def update(config: IQLConfig, state: IQLState, batch: Batch, key: Key) -> tuple[
     """
     del key
     nets, batch = _networks(config), normalizer.normalize_rows(state.normalizer, batch)
-    q = lowest_target(nets, state, batch)
+    q = steps.lowest_target(nets, state, batch)
     row_loss = partial(losses.expectile_loss, expectile=state.hyper.expectile)
-    value, of_value = step_value(nets, state, batch, lambda values: jax.vmap(row_loss)(values, q))
+    value, of_value = steps.step_value(nets, state, batch, lambda values: jax.vmap(row_loss)(values, q))
     state, of_actor = _update_actor(nets, state.replace(value=value), batch, q)
     state, of_critic = _update_critic(nets, state, batch)
     target = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
@@ -196,28 +195,6 @@ def make_iql(config: IQLConfig, hyper: Any = None) -> Learner:
 
 
 # --- one update -------------------------------------------------------------------------------------------------------
-
-
-def step_value(
-    nets: Networks,
-    state: Any,
-    batch: Batch,
-    row_losses: Callable[[Array], Array],
-    mean: Callable[[Array, Batch], Array] = losses.row_mean,
-) -> tuple[optim.Fit, Metrics]:
-    """V after a step on the mean of row_losses(values [B]) -> [B]. mean: over the rows that count."""
-
-    def loss(params: PyTree) -> tuple[Array, Array]:
-        values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)
-        return mean(row_losses(values), batch), values
-
-    fit, value, values = optim.minimise(nets.optimiser, loss, state.value, state.hyper.lr_value)
-    return fit, {"value/loss": value, "value/mean": mean(values, batch)}
-
-
-def lowest_target(nets: Networks, state: Any, batch: Batch) -> Array:
-    """min_i Q_i(s, a) [B] of the target critic at the rows' own actions."""
-    return jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
 
 
 def _update_actor(nets: Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:

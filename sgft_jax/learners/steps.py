@@ -96,6 +96,28 @@ def step_critic(
     return fit, {"critic/loss": value, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
 
 
+def step_value(
+    nets: Networks,
+    state: Any,
+    batch: Batch,
+    row_losses: Callable[[Array], Array],
+    mean: Callable[[Array, Batch], Array] = losses.row_mean,
+) -> tuple[optim.Fit, Metrics]:
+    """V after a step on the mean of row_losses(values [B]) -> [B]. mean: over the rows that count."""
+
+    def loss(params: PyTree) -> tuple[Array, Array]:
+        values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)
+        return mean(row_losses(values), batch), values
+
+    fit, value, values = optim.minimise(nets.optimiser, loss, state.value, state.hyper.lr_value)
+    return fit, {"value/loss": value, "value/mean": mean(values, batch)}
+
+
+def lowest_target(nets: Networks, state: Any, batch: Batch) -> Array:
+    """min_i Q_i(s, a) [B] of the target critic at the rows' own actions."""
+    return jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
+
+
 # --- policies ---------------------------------------------------------------------------------------------------------
 
 
