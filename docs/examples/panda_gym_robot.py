@@ -21,7 +21,7 @@ import robot_client
 
 importlib.import_module("panda_gym")  # registers its tasks
 
-PICTURE = {"render_width": 480, "render_height": 360, "render_distance": 0.9, "render_yaw": 60, "render_pitch": -30}
+PICTURE = {"render_width": 480, "render_height": 360, "render_distance": 0.7, "render_yaw": 60, "render_pitch": -30}
 
 
 class PandaPush:

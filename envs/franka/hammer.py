@@ -162,7 +162,7 @@ SCENE = arm.scene(
     success=success,
     check=check,
     dress=arm.dress,
-    view=View((0.33, 0.0, 0.58), 0.75, 122.0, -14.0, 0.0),
+    view=View((0.36, 0.0, 0.58), 0.52, 65.0, -16.0, 0.0),
 )
 
 

@@ -157,7 +157,7 @@ SCENE = arm.scene(
     success=success,
     check=check,
     dress=functools.partial(arm.dress, table=(-0.15, 0.75, 0.4)),
-    view=View((0.48, 0.0, 0.04), 0.5, 135.0, -24.0, arm.FLOOR),
+    view=View((0.49, 0.0, 0.05), 0.38, 135.0, -22.0, arm.FLOOR),
 )
 
 

@@ -165,7 +165,7 @@ SCENE = armless.scene(
     reward=reward,
     success=success,
     dress=dress,
-    view=View((-0.05, 0.0, 0.05), 0.9, 145.0, -30.0, -0.4),
+    view=View((-0.05, 0.0, 0.04), 0.7, 145.0, -32.0, -0.4),
 )
 
 

@@ -175,7 +175,7 @@ SCENE = arm.scene(
     success=success,
     event=falling(_puck, _lie),
     dress=functools.partial(arm.dress, table=TABLE_LEGS),
-    view=View((0.45, 0.0, 0.06), 1.1, 145.0, -30.0, arm.FLOOR),
+    view=View((0.57, 0.0, 0.04), 0.8, 155.0, -33.0, arm.FLOOR),
 )
 
 

@@ -35,7 +35,7 @@ def simulated(name: str, *, mass: float) -> Scene:
     ranges = {"object_x": (0.25, *NEAREST_FARTHEST), "object_mass": (mass, mass, mass)}
     parameters = tuple(Parameter(p.name, p.unit, *ranges.get(p.name, p[2:5]), *p[5:]) for p in push.PARAMETERS)
     # From the front, all of the edge in sight: the hand, which comes from behind, hides nothing of what it pushes.
-    view = View((0.58, 0.0, 0.045), 0.87, 172.0, -33.0, arm.FLOOR)
+    view = View((0.64, 0.0, 0.04), 0.64, 172.0, -30.0, arm.FLOOR)
     return push.SCENE._replace(name=name, parameters=parameters, view=view)
 
 

@@ -29,7 +29,8 @@ def render_episode(scene: Scene, theta: Mapping[str, float] | Sequence[float], q
     theta: domain parameters by name or in the order of `scene.parameters`. qpos: [T + 1, nq], one per control step.
     Raises UserError when MuJoCo cannot render here.
     """
-    _write(path, list(_frames(scene, theta, qpos)))
+    frames = list(_frames(scene, theta, qpos))
+    _write(path, frames, frames[len(frames) // 2])
 
 
 def render_side_by_side(
@@ -46,9 +47,9 @@ def render_side_by_side(
 
 
 def write_side_by_side(columns: Sequence[Sequence[np.ndarray]], captions: Sequence[str], path: Path) -> None:
-    """Writes columns of frames [*SIZE, 3] uint8, each under its caption, as one video, and its middle frame as .png.
+    """Writes columns of frames [*SIZE, 3] uint8, each under its caption, as one video, and its last frame as .png.
 
-    A column that ends earlier shows its last frame until the end.
+    A column that ends earlier shows its last frame until the end. The last frame shows how each has ended.
     """
     pairs = list(zip(map(_caption, captions), columns, strict=True))
 
@@ -56,7 +57,8 @@ def write_side_by_side(columns: Sequence[Sequence[np.ndarray]], captions: Sequen
         parts = [np.concatenate([strip, column[min(i, len(column) - 1)]]) for strip, column in pairs]
         return np.concatenate(parts, axis=1)
 
-    _write(path, [frame(i) for i in range(max(map(len, columns)))])
+    frames = [frame(i) for i in range(max(map(len, columns)))]
+    _write(path, frames, frames[-1])
 
 
 def smooth(qpos: np.ndarray, *, control_dt: float, fps: float) -> np.ndarray:
@@ -181,11 +183,11 @@ def _caption(text: str) -> np.ndarray:
     return np.asarray(strip)
 
 
-def _write(path: Path, frames: list[np.ndarray]) -> None:
+def _write(path: Path, frames: list[np.ndarray], still: np.ndarray) -> None:
     import imageio_ffmpeg
     import mediapy
 
     path.parent.mkdir(parents=True, exist_ok=True)
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     mediapy.write_video(path.with_suffix(".mp4"), frames, fps=FPS, crf=20)
-    mediapy.write_image(path.with_suffix(".png"), frames[len(frames) // 2])
+    mediapy.write_image(path.with_suffix(".png"), still)
