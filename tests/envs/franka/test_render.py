@@ -83,6 +83,14 @@ def test_side_by_side_waits_for_the_longer_episode(renderer, tmp_path):
     assert video[0, : render.CAPTION].max() > 150  # the captions
 
 
+def test_the_picture_beside_two_films_shows_how_both_have_ended(tmp_path):
+    """Three grey frames beside one that stays."""
+    columns = [[np.full((*render.SIZE, 3), grey, np.uint8) for grey in greys] for greys in ((50,), (0, 100, 200))]
+    render.write_side_by_side(columns, ["before", "after"], tmp_path / "both.mp4")
+    left, right = np.split(mediapy.read_image(tmp_path / "both.png")[render.CAPTION :], 2, axis=1)
+    assert (left == 50).all() and (right == 200).all()
+
+
 def test_no_renderer_is_one_line(monkeypatch, tmp_path):
     def broken(*args):
         raise RuntimeError("no display\nlong story")
