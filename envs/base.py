@@ -73,7 +73,6 @@ class Effects(NamedTuple):
     obs_bias: [measured_dim] raw units, constant calibration error of the sensors.
     action_noise: [act_dim] std of Gaussian noise that the robot adds to the command at every step, in units of its
         range; where it is not 0, the noisy command is clipped to [-1, 1].
-    action_deadzone: [] units of the range; a command that comes to less in an entry moves nothing there.
     """
 
     action_scale: Array
@@ -85,7 +84,6 @@ class Effects(NamedTuple):
     obs_noise_prob: Array
     obs_bias: Array
     action_noise: Array
-    action_deadzone: Array
 
 
 class EffectRange(NamedTuple):

@@ -12,10 +12,10 @@ from envs.types import Array, Key, UserError, unknown
 __all__ = ["distort", "draw", "make_range", "measure", "numbers", "ramp", "shake"]
 
 _DEFAULTS = {"action_scale": 1.0, "obs_noise_prob": 1.0}
-_NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob", "action_noise", "action_deadzone")
+_NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob", "action_noise")
 # Beyond these nothing is left of a command, in ranges of it, of a turn, in rad, or of a measurement kept in float32.
 _MOST = {
-    **dict.fromkeys(("action_scale", "action_bias", "action_noise", "action_deadzone"), 100.0),
+    **dict.fromkeys(("action_scale", "action_bias", "action_noise"), 100.0),
     "action_rotation": 2 * np.pi,
     **dict.fromkeys(("obs_noise", "obs_bias"), 1e6),
 }
@@ -107,12 +107,11 @@ def draw(effects: EffectRange, key: Key) -> Effects:
 
 
 def distort(effects: Effects, action: Array) -> Array:
-    """The action [act_dim] as the robot understands it: turned in the xy plane if Cartesian, scaled, offset."""
+    """The action [act_dim] as the robot understands it: rotated in the xy plane if Cartesian, scaled, offset."""
     if len(action) > 1:
         c, s = jnp.cos(effects.action_rotation), jnp.sin(effects.action_rotation)
         action = action.at[:2].set(jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]]))
-    command = effects.action_scale * action + effects.action_bias
-    return jnp.where(jnp.abs(command) < effects.action_deadzone, 0.0, command)
+    return effects.action_scale * action + effects.action_bias
 
 
 def shake(effects: Effects, command: Array, key: Key) -> Array:
