@@ -32,7 +32,6 @@ TASKS = {
     "walker2d": "envs.locomotion.walker2d",
     "wheel-legged": "envs.locomotion.wheel_legged",
     "wheel-legged-forward": "envs.locomotion.wheel_forward",
-    "rail": "envs.control.rail",
 }
 # Return at 0 and at 100 on the scale of D4RL, where 0 is a random policy and 100 an expert, by task.
 D4RL = {"halfcheetah": (-280.178953, 12135.0), "walker2d": (1.629008, 4592.3)}
