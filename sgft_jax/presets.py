@@ -26,7 +26,7 @@ class PretrainConfig(checks.Checked):
 
     algorithm: PretrainedName = "sac"
     """What is trained. sac: for all methods but these. tdmpc2: for `tdmpc2`, `sgft-tdmpc2` and `sgft-tdmpc2-code`.
-    recurrent: for `recurrent`. td3: for none yet."""
+    recurrent: for `recurrent`."""
     env_steps: Annotated[int, checks.least(1), checks.greatest(2**40)] = 8_000_000
     """Environment steps of training, after the random actions."""
     n_envs: checks.Count = 4096
@@ -78,9 +78,7 @@ class PretrainConfig(checks.Checked):
     entropy_per_dim: checks.Finite = -1.0
     """Target entropy of SAC per action dimension, nats."""
     policy_delay: checks.Few = 1
-    """Critic updates of SAC and TD3 per actor update."""
-    explore_noise: checks.NotNegative = 0.1
-    """Std of the noise on actions of TD3 in training."""
+    """Critic updates of SAC per actor update."""
     ensemble_size: checks.Few = 5
     """Dynamics models that SAC trains alongside."""
     precision: Precision = "default"
@@ -214,8 +212,6 @@ PRESETS: dict[str, PretrainConfig] = {
         lr=3e-4,
         lr_end=0.1,
     ),
-    # TD3 with its authors' delay, in the domain of `robust`.
-    "td3": replace(_ROBUST, algorithm="td3", policy_delay=2),
     # Two CPU cores, under three minutes, most of which go into the updates: one small update per environment step
     # learns pushing from 40,000 steps; 30,000 updates are too few, with 60,000 steps too.
     "cpu": PretrainConfig(
