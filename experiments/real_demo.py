@@ -18,6 +18,7 @@ from envs.types import UserError
 from experiments.runner import cli, real_systems
 from experiments.runner.finetune_args import arguments, run_folder
 from experiments.runner.options import at_least_one, check_prior, seed_list
+from experiments.runner.progress import doing
 from sgft_jax.io.cards import resolve_shipped
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
@@ -117,13 +118,13 @@ def bullet(home: Path, python: str) -> Path:
         return bullet_python
     if output(python, "import sys; sys.exit(sys.version_info[:2] != (3, 11))") is None:
         raise UserError(f"{python} is no Python 3.11, for which pybullet has wheels; name one with PYTHON311=...")
-    print(f"making an environment for Bullet in {home}, once", flush=True)
     install = [str(bullet_python), "-m", "pip", "install", "-q", *PACKAGES]
-    for command in ([python, "-m", "venv", "--clear", str(home)], install):
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            last = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
-            raise UserError(f"{' '.join(command[:4])} failed: {last}")
+    with doing(f"making an environment for Bullet in {home}", 60, once=True):
+        for command in ([python, "-m", "venv", "--clear", str(home)], install):
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode:
+                last = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
+                raise UserError(f"{' '.join(command[:4])} failed: {last}")
     return bullet_python
 
 

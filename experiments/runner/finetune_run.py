@@ -74,7 +74,7 @@ def run(
             members = seeds * len(args.real)
         count = len(priors) * getattr(args.options, "simulated_transitions", 0)
         rows = f" and {count:,} simulated transitions of the priors" if count else ""
-        with doing(f"making the real systems{rows}", 5 + count / 2_000):
+        with doing(f"making the real systems{rows}", 20 + count / 3_000 if count else 5):
             setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         inputs = {
@@ -272,7 +272,7 @@ class _Run(Training):
         if int(before.offline) < finetuning.simulated_updates_of(self.finetuner):
             return doing("learning from simulated transitions")
         if not self.done(before):
-            return doing("the first rollout, for which play and updates are compiled", 60, once=True)
+            return doing("playing the first rollout and compiling what learns from it", 60, once=True)
         return doing("playing and learning")
 
     def log(self, state: FinetuneProgress, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
@@ -317,7 +317,8 @@ class _Run(Training):
         facts = {"evidence": best.score, "rollouts": best.age}
         n = self.episodes
         if n and self.system.pools is not None:
-            played = finetuning.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
+            with doing("evaluating the best policies", 15, once=True):
+                played = finetuning.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
             facts["score"] = scores(played, best.worst)["score"]
         films = functools.cache(lambda: self._before_and_after(progress))
         summaries = []

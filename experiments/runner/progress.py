@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # commands announce their start before they draw a bar
     from rich.console import Console
     from rich.progress import Progress
 
-_FIRST, _AGAIN, _SELDOM = 2.0, 10.0, 60.0  # s of silence: before the first words, then between two lines
+_FIRST, _AGAIN, _SELDOM = 2.0, 10.0, 30.0  # s of silence: before the first words, then between two lines
 _COMPILING = "/jax/core/compile/"  # how the names of the events begin that JAX reports of it
 
 
@@ -58,7 +58,7 @@ class _Voice:
         elif self.said and now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
             words = phase.words if self.phases or self.said == {start.words} else "working"  # between two phases
             compiling = ", compiling" if any((self.depths or {}).values()) else ""
-            say(f"still {words} ({_duration(lasts)} so far{compiling})")
+            say(f"still {words} ({_duration(lasts)} so far{compiling})" if lasts >= 1 else words)
 
     def listen(self) -> None:
         """Hears from JAX, once it is imported, when it compiles."""
@@ -113,7 +113,7 @@ def doing(words: str, about: float | None = None, *, once: bool = False) -> Iter
 def never_silent() -> Iterator[None]:
     """Where the block writes nothing for long, a thread says what it is doing, and since when.
 
-    That is after ten seconds, then more and more seldom, down to once a minute.
+    That is after ten seconds, then more seldom, at last every half a minute.
     """
     start, cpu, over = _Phase("starting", time.monotonic()), time.process_time(), threading.Event()
     _VOICE.said.clear()

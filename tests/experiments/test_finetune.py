@@ -215,9 +215,10 @@ def test_a_run_says_what_it_is_doing(home):
         "making the real systems (about 5 s)",
         "preparing the agents (about 10 s, once)",
         "evaluating (about 15 s, once)",
-        "the first rollout, for which play and updates are compiled (about 60 s, once)",
+        "playing the first rollout and compiling what learns from it (about 60 s, once)",
         "writing a checkpoint",
         "playing and learning",
+        "evaluating the best policies (about 15 s, once)",
     ]
 
 
