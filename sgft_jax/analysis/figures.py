@@ -33,7 +33,7 @@ _MORE = """
 _METHODS = """
     guarded sgft-sac sac mbpo tdmpc2 sgft-mpc sysid recurrent sgft-relabel h2oplus rebrac darc iql rlpd sgft-tdmpc2 sgft
     pbrs pbrs-branch sac-online sac-reset frozen-critic sgft-tdmpc2-code sgft-parts h2o h2oplus-edac cql edac"""
-COLOURS = dict(zip(_METHODS.split(), (*PALETTE, *_MORE.split()), strict=True))  # far apart, and from the lines in grey
+COLOURS: dict[str, str] = dict(zip(_METHODS.split(), (*PALETTE, *_MORE.split()), strict=True))  # all far apart
 
 type Points = Mapping[str, tuple[np.ndarray, np.ndarray]]  # [n] V_sim and [n] returns, by where they are from
 
