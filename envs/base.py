@@ -206,6 +206,7 @@ class Env(NamedTuple):
     measures(next_obs [..., T, measured_dim], valid [..., T]) -> {name: [...]}: what else whole episodes are judged by,
         in numpy. The steps that are not valid come last.
     table: whether six-column text files, the logs of a wheel-legged robot (docs/hybrid.md), are records of it.
+    prepare(): compiles what the physics engine compiles itself, see `envs.mujoco.engines.Engine`.
     impl: the physics engine. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
@@ -234,6 +235,7 @@ class Env(NamedTuple):
     simulator: Callable[[], Callable[[Array, Array], Array]] | None = None
     measures: Callable[[Any, Any], dict[str, Any]] = lambda next_obs, valid: {}
     table: bool = False
+    prepare: Callable[[], None] = lambda: None
     impl: str = "jax"
     scene: str = ""
 

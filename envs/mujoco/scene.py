@@ -125,8 +125,8 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
 
     def make_worlds(theta: Theta) -> World:
         rows = np.asarray(theta.params, np.float64)
-        specs = (scene.build(dict(zip(nominal, map(float, row), strict=True))) for row in rows)
-        stacked = {k: jnp.asarray(v) for k, v in physics.compile_worlds(host, specs, fields).items()}
+        thetas = [dict(zip(nominal, map(float, row), strict=True)) for row in rows]
+        stacked = jax.tree.map(jnp.asarray, physics.compile_worlds(host, scene.build, nominal, thetas, fields))
         return World(theta._replace(params=jnp.asarray(rows, jnp.float32)), stacked)
 
     def reset(world: World, key: Key) -> EnvState:
@@ -146,6 +146,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         reset=reset,
         step=functools.partial(_step, scene, engine),
         restore=scene.settled and functools.partial(restore, scene.settled),
+        prepare=engine.prepare,
         trace=lambda state: state.qpos,
         impl=impl,
         scene=scene.variant,

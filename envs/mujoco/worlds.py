@@ -7,7 +7,7 @@ and all constants derived from them), because no derived field is ever recompute
 
 import importlib
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from operator import attrgetter
 from typing import Literal, NamedTuple, get_args
 
@@ -17,10 +17,12 @@ import mujoco
 import numpy as np
 
 from envs.mujoco.engines import CARRIED, Engine, carried, comparison
+from envs.mujoco.processes import in_parallel
 from envs.types import Array, UserError, brief, unknown
 
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
 IMPL_VARIABLE = "SGFT_IMPL"
+WORTH = 256  # worlds for which a process is worth its start, which takes as long
 # MuJoCo's kinds of state that a step continues with a `PhysicsState`, or that no step of ours ever changes.
 _KEPT = ("TIME", "QPOS", "QVEL", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE")
 _STATES = {
@@ -101,15 +103,41 @@ def varying_fields(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec]) -> t
 
 
 def compile_worlds(
-    nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec], names: tuple[str, ...]
+    nominal: mujoco.MjModel,
+    build: Callable[[dict[str, float]], mujoco.MjSpec],
+    theta: dict[str, float],
+    thetas: Sequence[dict[str, float]],
+    names: tuple[str, ...],
 ) -> dict[str, np.ndarray]:
-    """Compiles one model per spec and stacks the fields `names` (see `varying_fields`): name -> [n, ...].
+    """Compiles the spec of every theta and stacks the fields `names` (see `varying_fields`): name -> [n, ...].
+
+    nominal: the scene, compiled from build(theta). Many worlds are compiled in several processes.
 
     Raises UserError when MuJoCo refuses a spec, or when one differs from the nominal scene in anything else that a step
     reads: in its structure, which a compiled program cannot follow, or in what was the same in `varying_fields`.
     """
+    count, parts = min(os.cpu_count() or 1, len(thetas) // WORTH), None
+    if count > 1:
+        shares = [thetas[len(thetas) * i // count : len(thetas) * (i + 1) // count] for i in range(count)]
+        parts = in_parallel(_share, [(build, theta, share, names) for share in shares], keep=True)
+    if parts is None:
+        parts = [_stacked(nominal, map(build, thetas), names)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+
+def _share(
+    build: Callable[[dict[str, float]], mujoco.MjSpec],
+    theta: dict[str, float],
+    thetas: Sequence[dict[str, float]],
+    names: tuple[str, ...],
+) -> dict[str, np.ndarray]:
+    """What a process does of `compile_worlds`."""
+    return _stacked(build(theta).compile(), map(build, thetas), names)
+
+
+def _stacked(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec], names: tuple[str, ...]) -> dict[str, np.ndarray]:
     models = list(_compiled(nominal, specs, names))
-    return {k: np.stack([fields[k] for fields in models]) for k in names}
+    return {name: np.stack([fields[name] for fields in models]) for name in names}
 
 
 def exploded(state: PhysicsState, *, max_speed: float) -> Array:

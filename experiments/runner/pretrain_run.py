@@ -4,6 +4,7 @@
 """
 
 import functools
+import importlib
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +21,7 @@ from envs.gaps import SIM, Gap
 from envs.observations import blurred, varying, with_system
 from envs.rollout import Episode, heldout_worlds, load_gap, real_env, training_worlds
 from envs.types import PyTree
+from experiments.runner.ahead import Ahead, compiling
 from experiments.runner.cli import as_typed
 from experiments.runner.machines import folder_of_host, join_hosts, reserve
 from experiments.runner.pictures import film_episode
@@ -88,31 +90,65 @@ class _Run(Training):
         self.card = pretraining.prior_card(env, self.config)
         self.policy = make_policy(self.card, env)
         self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
-        self.shapes = functools.cache(lambda: pretraining.shapes(env, self.config, record.seeds, self.pools(0)))
+        self.shapes = functools.cache(self._shapes)
+        self.programs = pretraining.make_programs(env, self.config, len(self.seeds))
+        measure = functools.partial(make_report, env, self.policy, gamma=self.config.gamma)
+        self.measure = jax.jit(jax.vmap(functools.partial(measure, trajectories=self.config.eval_episodes)))
+        self.reports = args.report and self.policy.value is not None
         self.best: evidence.Best | None = None
 
     def work(self) -> dict[str, Any]:
         """Everything, in order."""
-        n, first = self.config.eval_episodes, jnp.zeros(self.count, jnp.int32)
-        count = self.count * self.config.worlds
+        with compiling() as ahead:
+            ahead.begin(self.env.prepare)
+            self._build()
+            state, done = None, 0
+            for saved, meta in self.restore(lambda: jax.eval_shape(self._saved, self.shapes()[1])):
+                (state, self.best), self.clock.seconds, done = saved, meta["seconds"], meta["env_steps"]
+            if mesh.pieces() == 1:  # threads would know nothing of a mesh
+                with self.announced(None):
+                    self._compile(ahead, begins=state is None)
+            data = {"pools": self.pools, "random": self._random(ahead), "programs": self.programs}
+            with self.announced(None):
+                ahead.wait(self.programs.train.init, self.programs.train.chunk, self.heldout.program(self.policy))
+                steps = pretraining.pretrain(self.env, self.config, self.seeds, state=state, **data)
+            self.follow(steps, done)
+            assert self.best is not None  # evaluated before the first chunk
+            ahead.wait(self.measure)
+        summary = self._hand_over(self.best)
+        self.record.log.close()
+        return summary
+
+    def _build(self) -> None:
+        """The worlds."""
+        n, count = self.config.eval_episodes, self.count * self.config.worlds
         with self.clock("worlds"), doing(f"building {count:,} worlds", 3 + 0.01 * count):
             self.pools(0)
             heldout, self.final = (
                 stacking.stack([heldout_worlds(self.env, self.gap, jax.random.key(seed), n)])
                 for seed in (_HELDOUT_SEED, _FINAL_SEED)
             )
-        self.heldout = Simulated(self.env, heldout, first, gamma=self.config.gamma)
-        state, done = None, 0
-        for saved, meta in self.restore(lambda: jax.eval_shape(self._saved, self.shapes()[1])):
-            (state, self.best), self.clock.seconds, done = saved, meta["seconds"], meta["env_steps"]
-        data = {"pools": self.pools, "random": self._random()}
-        with self.announced(None):
-            steps = pretraining.pretrain(self.env, self.config, self.seeds, state=state, **data)
-        self.follow(steps, done)
-        assert self.best is not None  # evaluated before the first chunk
-        summary = self._hand_over(self.best)
-        self.record.log.close()
-        return summary
+        self.heldout = Simulated(self.env, heldout, jnp.zeros(self.count, jnp.int32), gamma=self.config.gamma)
+
+    def _compile(self, ahead: Ahead, *, begins: bool) -> None:
+        """Begins to compile all programs, first what takes longest."""
+        n, worlds, (random, state) = self.config.eval_episodes, self.pools(0), self.shapes()
+        params = jax.eval_shape(functools.partial(pretraining.exported, self.env, self.config), state)
+        keys = jnp.broadcast_to(jax.random.split(jax.random.key(0), n), (self.count, n))
+        ahead.compile(self.programs.train.chunk, worlds, random, state)
+        if begins:
+            ahead.compile(self.programs.collect, worlds, seed_keys(self.seeds, Pretraining.RANDOM))
+            ahead.compile(self.programs.train.init, worlds, random, seed_keys(self.seeds, Pretraining.START))
+        ahead.compile(self.heldout.program(self.policy), params, self.heldout.pools, self.heldout.which, keys, False)
+        if self.reports:
+            ahead.compile(self.measure, worlds, params, seed_keys(self.seeds, Pretraining.REPORT))
+        ahead.begin(functools.partial(importlib.import_module, "tensorboardX"))  # seconds, where PyTorch is installed
+
+    def _shapes(self) -> tuple[PyTree, FleetState]:
+        """Shapes and types of the random experience and of the state: what checkpoints are read into."""
+        worlds, programs = self.pools(0), self.programs
+        random = programs.collect.eval_shape(worlds, seed_keys(self.seeds, Pretraining.RANDOM))
+        return random, programs.train.init.eval_shape(worlds, random, seed_keys(self.seeds, Pretraining.START))
 
     def _pools(self, number: int) -> World:
         """The worlds [seeds, W] of a set."""
@@ -124,14 +160,15 @@ class _Run(Training):
         params = pretraining.exported(self.env, self.config, state)
         return Saved(state, evidence.nothing_known(params, self.count, self.config.eval_episodes))
 
-    def _random(self) -> PyTree:
+    def _random(self, ahead: Ahead) -> PyTree:
         """Experience under random actions: collected once, then read from disk."""
         folder, expect = self.record.home / "random", self.record.expect
         if checkpoint.latest(folder) is not None:
             return checkpoint.restore(folder, self.shapes()[0], expect=expect)[0]
         count = self.count * self.config.random_transitions
         with self.clock("random"), doing(f"collecting {count:,} random transitions", 15 + count / 200_000, once=True):
-            rows = pretraining.collect_random(self.env, self.config, self.seeds, self.pools(0))
+            ahead.wait(self.env.prepare, self.programs.collect)
+            rows = self.programs.collect(self.pools(0), seed_keys(self.seeds, Pretraining.RANDOM))
             random = jax.block_until_ready(rows)
         checkpoint.save(folder, 0, mesh.local(random), meta=expect)
         return random
@@ -168,12 +205,12 @@ class _Run(Training):
         """Priors with their cards, report, figures, summary, closing words."""
         report = None
         with self.clock("report"):
-            if self.args.report and self.policy.value:
+            if self.reports:
                 with doing("measuring V_sim and the models", 20, once=True):
                     report = self._report(best.params)
             with doing("playing fresh episodes for the cards", 5):
                 played = self._final_episodes(best.params)
-        results = []
+        best, results = jax.device_get(best), []
         for i, seed in enumerate(self.seeds):
             chosen = stacking.member(best, i)
             name = digest(Prior(chosen.params, {}))  # by which runs of fine-tuning tell which priors they began from
@@ -225,10 +262,7 @@ class _Run(Training):
 
     def _report(self, params: PyTree) -> Report:
         """[seeds] measurements, as NumPy arrays."""
-        measure = functools.partial(
-            make_report, self.env, self.policy, gamma=self.config.gamma, trajectories=self.config.eval_episodes
-        )
-        report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, Pretraining.REPORT))
+        report = self.measure(self.pools(0), params, seed_keys(self.seeds, Pretraining.REPORT))
         return jax.tree.map(np.asarray, mesh.local(report))
 
     def _save_report(self, seed: int, report: Report, i: int) -> None:

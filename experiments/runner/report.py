@@ -61,8 +61,7 @@ def make_report(
 
 def numbers(report: Report) -> dict[str, Any]:
     """A report (NumPy arrays) as JSON data: what stands in summary.json and on the card."""
-    quality = value.report(jnp.asarray(report.values[report.counts]), jnp.asarray(report.returns[report.counts]))
-    summary: dict[str, Any] = {name: float(x) for name, x in quality.items()}
+    summary: dict[str, Any] = value.report(report.values[report.counts], report.returns[report.counts])
     if report.model_error.size:
         summary["dynamics/error"] = report.model_error.tolist()
         summary["dynamics/error_if_nothing_moved"] = report.still_error.tolist()

@@ -4,14 +4,16 @@ It is the mean of the critic over the policy's actions. A critic of SAC counts l
 """
 
 import jax
-import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
 
 from envs.types import Array, PyTree
+from sgft_jax.math.stats import rank_correlation
 from sgft_jax.models.networks import Network, precision
 from sgft_jax.models.normalizer import normalize
-from sgft_jax.types import Metrics, Normalizer
+from sgft_jax.types import Normalizer
 
-__all__ = ["discounted_returns", "explained_variance", "predict", "rank_correlation", "report"]
+__all__ = ["discounted_returns", "predict", "report"]
 
 
 def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array) -> Array:
@@ -35,22 +37,15 @@ def discounted_returns(rewards: Array, discounts: Array, bootstrap: Array) -> Ar
     return jax.lax.scan(back, bootstrap, (rewards, discounts), reverse=True)[1]
 
 
-def explained_variance(values: Array, returns: Array) -> Array:
-    """1 - Var(returns - values) / Var(returns), both [N]: 1 is perfect, 0 no better than a constant."""
-    return 1 - jnp.var(returns - values) / jnp.maximum(jnp.var(returns), 1e-12)
+def report(values: ArrayLike, returns: ArrayLike) -> dict[str, float]:
+    """Quality of V against Monte-Carlo returns, both [N], on the host.
 
-
-def rank_correlation(values: Array, returns: Array) -> Array:
-    """Spearman's rho, both [N], ties broken by order: shaping cares about order more than about scale."""
-    ranks = [jnp.argsort(jnp.argsort(x)).astype(jnp.float32) for x in (values, returns)]
-    a, b = (r - jnp.mean(r) for r in ranks)
-    return jnp.sum(a * b) / jnp.maximum(jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2)), 1e-12)
-
-
-def report(values: Array, returns: Array) -> Metrics:
-    """Quality of V against Monte-Carlo returns, both [N]."""
+    The explained variance is 1 - Var(returns - values) / Var(returns): 1 is perfect, 0 no better than a constant. The
+    rank correlation is Spearman's: shaping cares about order more than about scale.
+    """
+    promised, earned = np.asarray(values, np.float64), np.asarray(returns, np.float64)
     return {
-        "value/explained_variance": explained_variance(values, returns),
-        "value/rank_correlation": rank_correlation(values, returns),
-        "value/bias": jnp.mean(values - returns),
+        "value/explained_variance": float(1 - np.var(earned - promised) / max(np.var(earned), 1e-12)),
+        "value/rank_correlation": float(rank_correlation(np.stack([promised, earned], axis=1))),
+        "value/bias": float(np.mean(promised - earned)),
     }

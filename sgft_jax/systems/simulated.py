@@ -73,9 +73,13 @@ class Simulated:
 
     def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
         """Episodes [M, n, ...], see `System`. A key gives the same world, start and noise to every policy."""
-        if policy.act not in self._programs:  # exploring and evaluating share it: compiling physics takes long
+        return self.program(policy)(states, self.pools, self.which, keys, explore)
+
+    def program(self, policy: Any) -> Any:
+        """What plays (states, pools, which, keys, explore), jitted: exploring and evaluating share it."""
+        if policy.act not in self._programs:
             self._programs[policy.act] = jax.jit(split_vmap(self._player(policy), (0, None, 0, 0, None)))
-        return self._programs[policy.act](states, self.pools, self.which, keys, explore)
+        return self._programs[policy.act]
 
     def moved(self, pools: World, which: Array) -> "Simulated":
         """Other systems of the same task, played by the programs that are compiled already."""

@@ -157,7 +157,7 @@ class Trainer(NamedTuple):
     renew(pool, state) -> state with new episodes in the worlds of that pool.
     """
 
-    init: Callable[[World, PyTree, Key], FleetState]
+    init: Any
     chunk: Any
     renew: Callable[[World, FleetState], FleetState]
 

@@ -43,8 +43,8 @@ def train(
     plan = make_plan(env, agent, schedule)
     programs = fleet.make_programs(fleet.make_trainer(env, plan, gamma=gamma, note=note), keys.shape[0], shared=True)
     real = jax.tree.map(jnp.asarray, real)
-    state = state or programs.init(pools, real, keys)
-    return fleet.train(plan, programs, lambda number: pools, agent.keep(real), state)
+    begun = programs.init(pools, real, keys) if state is None else state
+    return fleet.train(plan, programs, lambda number: pools, agent.keep(real), begun)
 
 
 def shape_of(env: Env, agent: HybridAgent, schedule: Schedule, pools: World, real: RealData, keys: Key) -> FleetState:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,22 @@ _RANDOM_STEPS = 3_125  # of a simulator under random actions, at most
 Pools = Callable[[int], World]  # number of a set of worlds -> its worlds [M, W], a pool for each member
 
 
+class Programs(NamedTuple):
+    """What pretraining compiles, of M members.
+
+    collect(worlds [M, W], keys [M]) -> experience [M, ...] under random actions. train: see `fleet.make_programs`.
+    """
+
+    collect: Any
+    train: Trainer
+
+
+def make_programs(env: Env, config: PretrainConfig, members: int) -> Programs:
+    """Jitted: they compile when they are first called, or before, by `lower(...).compile()`."""
+    collect = over_members(functools.partial(random_experience, env, config), members)
+    return Programs(jax.jit(collect), fleet.make_programs(make_trainer(env, config), members, shared=False))
+
+
 # --- the iterator -----------------------------------------------------------------------------------------------------
 
 
@@ -40,41 +56,27 @@ def pretrain(
     pools: Pools | None = None,
     random: PyTree = None,
     state: FleetState | None = None,
+    programs: Programs | None = None,
 ) -> Iterator[tuple[FleetState, Metrics]]:
     """Trains M members, one for each seed, for `config.env_steps` environment steps each, see `fleet.train`.
 
     pools: where they live; default the training domain of `env`. `config.refresh_every` decides when the next set is
-    asked for. random: experience under random actions, see `collect_random`; collected here if None. state: where an
+    asked for. random: experience under random actions, see `Programs`; collected here if None. state: where an
     earlier run stopped, or None. Both are consumed. Every random draw follows from the seeds, so a resumed run ends
-    like an uninterrupted one. A round of the state is one step of all environments.
+    like an uninterrupted one. A round of the state is one step of all environments. programs: see `make_programs`.
     """
     seeds = jnp.asarray(seeds, jnp.uint32)
     plan, members, pools = make_plan(env, config), len(seeds), pools or training_pools(env, config, seeds)
-    programs = fleet.make_programs(make_trainer(env, config), members, shared=False)
+    programs = programs or make_programs(env, config, members)
     if random is None:
-        random = collect_random(env, config, seeds, pools(0))
+        random = programs.collect(pools(0), seed_keys(seeds, Pretraining.RANDOM))
     else:
         random = jax.jit(over_members(fleet.spread_replay, members), donate_argnums=0)(random)
     if state is None:
-        begun = programs.init(pools(0), random, seed_keys(seeds, Pretraining.START))
+        begun = programs.train.init(pools(0), random, seed_keys(seeds, Pretraining.START))
     else:
         begun = jax.jit(over_members(fleet.spread, members), donate_argnums=0)(state)
-    return fleet.train(plan, programs, pools, random, begun, refresh_every=config.refresh_every)
-
-
-def collect_random(env: Env, config: PretrainConfig, seeds: Sequence[int] | Array, worlds: World) -> PyTree:
-    """Experience [M, ...] under uniformly random actions in `worlds` [M, W]: the first set of a run's pools."""
-    keys = seed_keys(seeds, Pretraining.RANDOM)
-    return jax.jit(over_members(functools.partial(random_experience, env, config), len(keys)))(worlds, keys)
-
-
-def shapes(env: Env, config: PretrainConfig, seeds: Sequence[int] | Array, worlds: World) -> tuple[PyTree, FleetState]:
-    """Shapes and types of a run's random experience and state: what checkpoints are read into."""
-    keys = seed_keys(seeds, Pretraining.START)
-    collect = over_members(functools.partial(random_experience, env, config), len(keys))
-    begin = over_members(make_trainer(env, config).init, len(keys))
-    random = jax.eval_shape(collect, worlds, keys)
-    return random, jax.eval_shape(begin, worlds, random, keys)
+    return fleet.train(plan, programs.train, pools, random, begun, refresh_every=config.refresh_every)
 
 
 def training_pools(

@@ -20,12 +20,13 @@ import envs
 from envs import gaps
 from experiments import pretrain
 from experiments.runner import progress
+from experiments.runner.ahead import Ahead
 from sgft_jax import api
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, read_jsonl
 from sgft_jax.io.priors import load_prior
 from sgft_jax.presets import PRESETS
-from sgft_jax.train import finetuning, pretraining
+from sgft_jax.train import finetuning
 
 TESTS = Path(__file__).parent.parent
 OPTIONS = """--task toy --preset cpu --no-video --config.n-envs 32 --config.worlds 16 --config.env-steps 10240
@@ -109,7 +110,7 @@ def short(out):
         patch.setattr(os, "environ", os.environ.copy())
         for limit in ("_AGAIN", "_SELDOM"):
             patch.setattr(progress, limit, 0.5)
-        patch.setattr(pretraining, "collect_random", compiled_slowly(pretraining.collect_random))
+        patch.setattr(Ahead, "wait", compiled_slowly(Ahead.wait))
         with contextlib.redirect_stderr(io.StringIO()) as words:
             pretrain.main([*TINY, *SHORT.split(), "--seeds", "2", "--out", str(out / "short")])
     (out / "short/words").write_text(words.getvalue())
@@ -136,11 +137,13 @@ def test_a_run_leaves_a_prior_per_seed_that_is_its_best_evaluation(short):
 
 @pytest.mark.heavy
 def test_a_run_says_what_it_is_doing(short, out):
-    words = (out / "short/words").read_text().splitlines()
-    assert [line for line in words if not line.startswith("still ") and line != "starting (some seconds)"] == [
+    words, first = (out / "short/words").read_text().splitlines(), {}
+    for line in words:
+        first.setdefault(line.partition(" (")[0], line)
+    assert [line for line in first.values() if not line.startswith("still ") and "starting" not in line] == [
         "building 32 worlds (about 3 s)",
-        "collecting 2,048 random transitions (about 15 s, once)",
         "compiling the training (about 30 s, once)",
+        "collecting 2,048 random transitions (about 15 s, once)",
         "evaluating (about 15 s, once)",
         "training",
         "writing a checkpoint",

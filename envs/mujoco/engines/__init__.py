@@ -17,10 +17,12 @@ class Engine(NamedTuple):
     fields: of the model that differ between worlds, by name. state: a `PhysicsState`.
     advance(fields, state, controls [substeps, nu]) -> the state after these steps.
     sense(fields, state) -> the same state with what its sensors read.
+    prepare(): compiles what JAX does not compile, which the first steps would do otherwise. It may go on in a thread.
     """
 
     advance: Callable[[dict[str, Array], PyTree, Array], PyTree]
     sense: Callable[[dict[str, Array], PyTree], PyTree] = lambda fields, state: state
+    prepare: Callable[[], None] = lambda: None
 
 
 class Feature(NamedTuple):

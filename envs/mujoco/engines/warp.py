@@ -23,6 +23,7 @@ from envs.types import Array, PyTree, UserError
 # leave MuJoCo and MJX together 0.7 mm from the converged solution and Warp elsewhere, 0.9 mm from theirs; with 6 it has
 # converged to a micrometre. Worlds stop once they have, so more cost little.
 _MORE_ITERATIONS = 4
+_STATE = ("qpos", "qvel", "qacc_warmstart")
 _POSES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat")
 
 
@@ -41,11 +42,16 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
     still, at_rest = put(host)
     ends = np.cumsum([host.nq, host.nv, host.nv])
 
+    size = {"contacts": contacts, "rows": rows, "iterations": iterations(host)}
+
     @functools.cache
     def call(layout: tuple[str, ...], move: bool) -> Any:
         """Worlds that differ in the same fields share buffers and graphs."""
-        size = {"contacts": contacts, "rows": rows, "iterations": iterations(host)}
         return warp_worlds.make_call(host, layout, move=move, **size)
+
+    def prepare() -> None:
+        layout = (*_STATE, *_POSES, *warp_worlds.as_read(dict.fromkeys(fields, jnp.ones(1))))
+        warp_worlds.compile_kernels(host, layout, **size)
 
     def placed(values: dict[str, Array], qpos: Array) -> dict[str, Array]:
         """Where everything is. Warp leaves what is fixed to the world where it was when its data were made."""
@@ -56,7 +62,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
     def batch(values: dict[str, Array], state: Any, controls: Array, *, move: bool) -> Any:
         """Worlds [n] after steps under controls [n, steps, nu], or, unless they move, what their sensors read."""
         n = len(controls)
-        parts = {"qpos": state.qpos, "qvel": state.qvel, "qacc_warmstart": state.warmstart}
+        parts = dict(zip(_STATE, (state.qpos, state.qvel, state.warmstart), strict=True))
         parts |= jax.vmap(placed)(values, state.qpos)
         parts |= warp_worlds.as_read(values)
         packed = jnp.concatenate([x.reshape(n, -1) for x in parts.values()], axis=1)
@@ -88,7 +94,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
     def sense(values: dict[str, Array], state: PyTree) -> PyTree:
         return state._replace(sensordata=sensed(values, state, state.ctrl[None]).sensordata)
 
-    return Engine(moved, sense)
+    return Engine(moved, sense, prepare)
 
 
 def available() -> bool:

@@ -6,8 +6,11 @@ and gets states back. On a GPU a physics step is one CUDA graph, captured once p
 the worlds' own, so it never has to be captured again.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import mujoco
@@ -15,9 +18,12 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
 from envs.mujoco.engines import FLUID
+from envs.mujoco.processes import in_parallel
 from envs.types import Array, UserError
 
 wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads
+
+_PROCESSES = 4  # that compile kernels: each takes some 10 s to start, and 0.5 GB of the GPU
 
 # Lost contacts and constraints; a solver that used up its iterations is how we run it.
 _LOSSES = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
@@ -95,6 +101,12 @@ class Worlds:
         wp.copy(self.data.ctrl, ctrl)
         mjw.forward(self.model, self.data)
 
+    def kernels(self) -> list[tuple[wp.Module, int | None]]:
+        """The modules of the kernels of a step, and threads of a block."""
+        with _noted() as modules:
+            self._step()
+        return list(modules)
+
     def step(self, ctrl: wp.array) -> None:
         """One physics step under commands [n, nu]."""
         wp.copy(self.data.ctrl, ctrl)
@@ -161,6 +173,46 @@ def make_call(
     call = wp.jax_callable(run, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
     states = host.nq + 2 * host.nv + host.nsensordata
     return lambda packed, controls: call(packed, controls, output_dims=(packed.shape[0], states))[0]
+
+
+def compile_kernels(host: mujoco.MjModel, layout: Sequence[str], **size: int) -> None:
+    """Compiles the kernels of a step in several processes, into Warp's cache.
+
+    Warp makes kernels as a step goes along, and would compile one module after another, each at its first launch:
+    during which XLA, which waits for the step, tries no kernels of other programs either.
+    """
+    if wp.is_cuda_available():
+        count = min(os.cpu_count() or 1, _PROCESSES)
+        in_parallel(_compile_share, [(host, layout, size, i, count) for i in range(count)], keep=False)
+
+
+def _compile_share(host: mujoco.MjModel, layout: Sequence[str], size: dict[str, int], i: int, count: int) -> None:
+    """What a process does of `compile_kernels`."""
+    with wp.ScopedDevice("cuda") as device:
+        modules = Worlds(host, layout, 1, **size).kernels()
+    with ThreadPoolExecutor() as threads:
+        loads = [threads.submit(wp.force_load, device, [module], block) for module, block in modules[i::count]]
+    for load in loads:
+        load.result()
+
+
+@contextlib.contextmanager
+def _noted() -> Iterator[dict[tuple[wp.Module, int | None], None]]:
+    """Launches are not made, but noted: modules of kernels and threads of a block. Loops go around once."""
+    modules: dict[tuple[wp.Module, int | None], None] = {}
+
+    def launch(kernel: wp.Kernel, *_: Any, block_dim: int | None = None, **__: Any) -> None:
+        modules[kernel.module, block_dim] = None
+
+    def loop(_: wp.array, while_body: Callable[..., None], **inputs: Any) -> None:
+        while_body(**inputs)
+
+    before = wp.launch, wp.launch_tiled, wp.capture_while
+    wp.launch, wp.launch_tiled, wp.capture_while = launch, launch, loop
+    try:
+        yield modules
+    finally:
+        wp.launch, wp.launch_tiled, wp.capture_while = before
 
 
 @wp.kernel

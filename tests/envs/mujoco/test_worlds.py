@@ -1,5 +1,6 @@
 """A world simulates exactly the model that MuJoCo compiles from the edited scene: every field, every constant."""
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from mujoco import mjx
 
 import envs
 from envs.domains import uniform
+from envs.mujoco import processes
 from envs.mujoco import worlds as physics
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.scene import make_env
@@ -68,7 +70,29 @@ def test_structure_must_not_change():
     spec = scene.build(nominal(scene))
     spec.worldbody.add_geom(size=[0.1, 0, 0])
     with pytest.raises(UserError, match="not its structure"):
-        physics.compile_worlds(host, [spec], ("body_mass",))
+        physics.compile_worlds(host, lambda theta: spec, {}, [{}], ("body_mass",))
+
+
+@pytest.mark.heavy
+def test_processes_compile_the_same_worlds(monkeypatch):
+    """And a scene whose function no other process can find is compiled here."""
+    env = make_env(SCENES["push"], "c")
+    theta = uniform(env).sample((), jax.random.key(0), 7)
+    here = env.make_worlds(theta)
+    calls = []
+
+    def in_parallel(*args, keep):
+        calls.append(processes.in_parallel(*args, keep=False))
+        return calls[-1]
+
+    monkeypatch.setattr(physics, "WORTH", 3)
+    monkeypatch.setattr(physics, "in_parallel", in_parallel)
+    monkeypatch.setattr(physics.os, "cpu_count", lambda: 2)
+    chex.assert_trees_all_equal(env.make_worlds(theta), here)
+    assert [len(part["body_mass"]) for part in calls[0]] == [3, 4]
+    nameless = SCENES["push"]._replace(build=lambda theta: SCENES["push"].build(theta))
+    chex.assert_trees_all_equal(make_env(nameless, "c").make_worlds(theta), here)
+    assert calls[1] is None
 
 
 def test_what_mujoco_refuses_is_one_line():
