@@ -104,7 +104,8 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
             last.callback(system.close)
         else:
             world = real_env(env, [gap for gap in reals if gap])
-            pools = [padded(heldout_worlds(world, gap, key_worlds, args.episodes), args.episodes) for gap in reals]
+            with doing(f"building {args.episodes:,} worlds for each system", 3 + 0.01 * args.episodes * len(reals)):
+                pools = [padded(heldout_worlds(world, gap, key_worlds, args.episodes), args.episodes) for gap in reals]
             which = jnp.repeat(jnp.arange(len(pools)), len(priors))
             system = Simulated(world, stack(pools), which, gamma=card["gamma"])
         if is_robot(args.real[0]):  # what it does is kept

@@ -66,7 +66,7 @@ def diagnose(
         who = "one prior" if len(priors) == 1 else f"each of {len(priors)} priors"
         what = f"{_rollouts(count)} of {who}, just played zero-shot on {where}"
     labels = [str(folders[p]) for p in which]
-    with doing("examining the rollouts", 30, once=True):
+    with doing("examining the rollouts", 40, once=True):
         examined, mean = _examine(env, priors, real, simulated, which)
     names = names_of(env)
     signs, header = verdict.signs(mean[-1], names), f"{env.name}: {what}"

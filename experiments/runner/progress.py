@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # commands announce their start before they draw a bar
     from rich.console import Console
     from rich.progress import Progress
 
-_FIRST, _AGAIN, _SELDOM = 2.0, 10.0, 30.0  # s of silence: before the first words, then between two lines
+_FIRST, _AGAIN, _SELDOM = 3.0, 10.0, 30.0  # s of silence: before the first words, then between two lines
 _COMPILING = "/jax/core/compile/"  # how the names of the events begin that JAX reports of it
 
 

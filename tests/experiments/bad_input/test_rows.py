@@ -52,13 +52,14 @@ def faults(rows, folder, *argv):
     return [
         f"{command[:100]}: {wrong}"
         for (command, words, *_), answer in zip(rows, answers, strict=True)
-        if (wrong := fault(words, **answer))
+        if (wrong := fault(words, **answer, begun=not argv))
     ]
 
 
-def fault(words, *, code, out, err, changed):
-    """What is wrong with one of them, None if nothing is."""
-    if code != 2 or err.count("\n") != 1 or not err.startswith("error: "):
+def fault(words, *, code, out, err, changed, begun):
+    """What is wrong with one of them, None if nothing is. begun: whether it may have said what it was doing until then."""
+    *phases, error = err.splitlines() or [""]
+    if code != 2 or not error.startswith("error: ") or (phases and not begun) or "Traceback" in err:
         return f"exit code {code}: {err[-1000:]}"
     if words not in err:
         return f"says {err[:300].rstrip()}, not {words}"
