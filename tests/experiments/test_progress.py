@@ -1,15 +1,17 @@
 """What commands tell while they work: phases, lines after some silence, progress of loops."""
 
+import ast
 import contextlib
 import io
 import re
 import time
+from pathlib import Path
 
 import pytest
 from jax import monitoring
 from rich.console import Console
 
-from experiments.runner import progress
+from experiments.runner import cli, progress
 from experiments.runner.progress import RunProgress, doing, never_silent
 
 COMPILE = "/jax/core/compile/backend_compile_duration"  # what JAX reports of its compiler
@@ -126,3 +128,41 @@ def test_nothing_fails_for_want_of_a_reader(monkeypatch):
     monkeypatch.setattr("sys.stderr", closed)
     with never_silent(), doing("working on"):
         pass
+
+
+def announced(path):
+    """What the calls of `doing` in a file say; "..." for what the run decides."""
+    calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    texts = [call.args[0] for call in calls if ast.unparse(call.func) == "doing"]
+    return {re.sub(r"\{[^{}]*(\[[^]]*\])?[^{}]*\}", "...", ast.unparse(text).strip("f'\"")) for text in texts}
+
+
+def test_the_phases_of_every_command():
+    """By the file that announces them. Commands without are done in seconds, or run those that are here."""
+    files = Path(cli.__file__).parents[1].rglob("*.py")
+    assert {path.stem: phases for path in files if (phases := announced(path))} == {
+        "benchmark": {"measuring ...: ..."},
+        "collect_run": {"compiling the training", "playing the episodes to record"},
+        "diagnose_run": {"playing ... of each prior", "examining the rollouts"},
+        "evaluate": {"building ... worlds for each system", "playing ... episodes for each policy"},
+        "export": {"exporting to ... and comparing actions"},
+        "finetune_run": {
+            "making the real systems...",
+            "preparing the agents",
+            "learning from simulated transitions",
+            "playing the first rollout and compiling what learns from it",
+            "playing and learning",
+            "evaluating the best policies",
+        },
+        "gaps_run": {"playing ... episodes on each real system", "building the worlds and compiling the training"},
+        "hybrid_run": {"building the worlds"},
+        "pictures": {"rendering a video"},
+        "pretrain_run": {
+            "building ... worlds",
+            "collecting ... random transitions",
+            "measuring V_sim and the models",
+            "playing fresh episodes for the cards",
+        },
+        "real_demo": {"making an environment for Bullet in ..."},
+        "training": {"compiling the training", "training", "evaluating", "writing a checkpoint"},
+    }

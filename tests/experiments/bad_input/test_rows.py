@@ -57,7 +57,7 @@ def faults(rows, folder, *argv):
 
 
 def fault(words, *, code, out, err, changed, begun):
-    """What is wrong with one of them, None if nothing is. begun: whether it may have said what it was doing until then."""
+    """What is wrong with one of them, None if nothing is. begun: whether it may have said what it was doing."""
     *phases, error = err.splitlines() or [""]
     if code != 2 or not error.startswith("error: ") or (phases and not begun) or "Traceback" in err:
         return f"exit code {code}: {err[-1000:]}"
