@@ -5,7 +5,8 @@ and automatic reset, against the bare engine under it, which repeats the same ph
 updates: SAC updates of pretraining, with all its networks, against the same update written by hand in bare JAX.
 hybrid: updates of a hybrid run (H2O+ with its simulators), against its update written by hand in bare JAX, alone.
 plain: updates of plain SAC, against Stable-Baselines3 and SBX where they are installed.
-pretrain, finetune: seconds of the whole commands, with what the time goes into.
+startup: seconds from the start of a pretraining process to its priors, with empty caches and with filled ones.
+finetune: seconds of the whole command, with what the time goes into.
 system: a rollout of fine-tuning with its updates, against the same in one compiled program.
 devices: pretraining on several devices with as many times the environments and batches (weak scaling), against as many
 times one device.
@@ -27,7 +28,7 @@ from sgft_jax.io.runs import check_folder, provenance
 from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 
-type Part = Literal["physics", "updates", "plain", "hybrid", "pretrain", "finetune", "system", "devices"]
+type Part = Literal["physics", "updates", "plain", "hybrid", "startup", "finetune", "system", "devices"]
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,9 @@ class BenchmarkConfig:
     repeats: int = 3
     """Timed calls; the fastest counts."""
     preset: str = "fast"
-    """Pretraining preset, for pretrain and devices."""
+    """Pretraining preset, for startup and devices."""
     env_steps: int | None = None
-    """Environment steps, for pretrain and for each device in devices; default: the preset's."""
+    """Environment steps, for startup and for each device in devices; default: the preset's."""
     devices: tuple[int, ...] = (1,)
     """Numbers of devices; all are compared with the smallest."""
     prior: Path | None = None
@@ -130,7 +131,7 @@ _KINDS: dict[Part, _Kind] = {
     "updates": _Kind("updates of pretraining", "updates.speed", _NETWORKS, _UPDATES),
     "plain": _Kind("updates of plain SAC", "updates.plain_speed", {"batch": "batches"}, _UPDATES),
     "hybrid": _Kind("updates of hybrid runs", "updates.hybrid_speed", {**_TASK, "members": "seeds"}, _UPDATES),
-    "pretrain": _Kind("pretraining", "training.pretraining", _SEEDS, ("preset", "env_steps")),
+    "startup": _Kind("from command to priors", "startup.to_priors", _SEEDS, ("preset", "env_steps")),
     "finetune": _Kind("fine-tuning with SGFT-SAC", "training.fine_tuning", _SEEDS, ("prior", "rollouts")),
     "system": _Kind("fine-tuning through a real system", "training.through_system", _SEEDS, ("prior", "repeats")),
     "devices": _Kind(

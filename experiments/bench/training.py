@@ -1,5 +1,5 @@
-"""Wall clock of the whole commands: pretraining with what it leaves and over devices, fine-tuning by number of seeds,
-and what fine-tuning through a `System` costs against one compiled program.
+"""Wall clock of whole commands: pretraining over devices, fine-tuning by number of seeds, and what fine-tuning through
+a `System` costs against one compiled program.
 
 The commands run in folders that are thrown away. What is timed as a whole runs twice: the second time its programs come
 from JAX's compilation cache, so the difference is what compiling costs, if the cache did not hold them before.
@@ -34,23 +34,6 @@ from sgft_jax.train import finetuning
 from sgft_jax.types import Metrics
 
 _NEVER = 10**9  # chunks between what training is not slowed by
-
-
-def pretraining(task: str, impl: Impl, seeds: int, *, preset: str, env_steps: int | None) -> dict[str, Any]:
-    """Seconds from nothing to priors, and the worst seed's success and explained variance of V_sim."""
-    config = PRESETS[preset] if env_steps is None else replace(PRESETS[preset], env_steps=env_steps)
-
-    def run(out: Path) -> dict[str, Any]:
-        args = PretrainArgs(task=task, preset=preset, config=config, seeds=seeds, impl=impl, video=False, out=out)
-        return pretrain(args)
-
-    first_s, (summary, seconds) = _twice(run)
-    line = {"task": task, "impl": summary["impl"], "seeds": seeds, "env_steps": summary["env_steps"]}
-    line |= {"seconds": seconds, "first_run_s": first_s}
-    for name, value in (("success", "success"), ("explained_variance", "value/explained_variance")):
-        line[name] = min(seed[value] for seed in summary["seeds"])
-    parts = ("worlds", "random", "train", "evaluate", "report")
-    return line | {f"{part}_s": summary[f"time/{part}_s"] for part in parts}
 
 
 def weak_scaling(

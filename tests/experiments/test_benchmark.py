@@ -1,8 +1,10 @@
 """The benchmark measures what it says it does; how fast things are is not tested."""
 
 import json
+import os
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -14,7 +16,7 @@ from priors_by_hand import save_prior
 from envs.franka import hammer
 from envs.mujoco.worlds import PhysicsState
 from envs.types import UserError
-from experiments.bench import physics, training, updates
+from experiments.bench import physics, startup, training, updates
 from experiments.bench.timing import fastest, fastest_in_turns, measure
 from experiments.benchmark import BenchmarkConfig, main
 
@@ -169,20 +171,28 @@ def test_a_library_that_does_not_import_is_left_out_with_a_word(monkeypatch, cap
     assert capsys.readouterr().out == "sbx is installed but left out: AttributeError: no pytype_aval_mappings\n"
 
 
-def test_whole_commands_run_twice_in_folders_that_vanish(monkeypatch):
-    folders = []
+def test_startup_is_measured_with_empty_caches_and_with_filled_ones(monkeypatch):
+    caches = []
 
-    def pretrain(args):
-        assert args.config.env_steps == 77 and args.out.is_dir()
-        folders.append(args.out)
-        times = {f"time/{part}_s": 1.0 for part in ("worlds", "random", "train", "evaluate", "report")}
-        seeds = [{"success": s, "value/explained_variance": v} for s, v in ((1.0, 0.5), (0.9, 0.7))]
-        return {"impl": "c", "env_steps": 80, "seeds": seeds, **times}
+    def run(command, *, env, stdout):
+        out = Path(command[-1].removeprefix("--out="))
+        assert command[1:3] == ["-m", "experiments.pretrain"] and "--config.env-steps=77" in command
+        caches.append((env["SGFT_CACHE_DIR"], env["WARP_CACHE_PATH"]))
+        folder = out / "pretrain/push/cpu/seeds-0-1"
+        (folder / "prior").mkdir(parents=True)
+        os.utime(folder / "prior", (time.time() + 5, time.time() + 5))
+        seeds = [{"success": 1.0}, {"success": 0.9}]
+        (folder / "summary.json").write_text(json.dumps({"impl": "c", "seeds": seeds, "time/train_s": 2.0}))
+        return SimpleNamespace(returncode=0)
 
-    monkeypatch.setattr(training, "pretrain", pretrain)
-    found = training.pretraining("push", "c", 2, preset="cpu", env_steps=77)
-    assert len(set(folders)) == 2 and not any(folder.exists() for folder in folders)
-    assert found["success"] == 0.9 and found["explained_variance"] == 0.5 and found["env_steps"] == 80
+    monkeypatch.setattr(startup.subprocess, "run", run)
+    empty, filled = startup.to_priors("push", "c", 2, preset="cpu", env_steps=77)
+    assert caches[0] == caches[1] and not Path(caches[0][0]).parent.exists()
+    assert (empty["caches"], filled["caches"]) == ("empty", "filled")
+    assert empty["success"] == 0.9 and empty["train_s"] == 2.0 and 5 <= empty["prior_s"] < 6
+    monkeypatch.setattr(startup.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=2))
+    with pytest.raises(UserError, match=r"startup: experiments.pretrain --task=push .* has failed, see above"):
+        startup.to_priors("push", "c", 2, preset="cpu", env_steps=None)
 
 
 def test_devices_get_their_shares_and_are_compared_with_as_many_times_one(monkeypatch):
