@@ -28,14 +28,16 @@ class _Phase(NamedTuple):
 class _Voice:
     """What this process says of its work. There is one, as there is one stderr.
 
-    phases: the innermost last. said: all that has been announced. heard: when the last line was written, s (monotonic).
+    phases: the innermost last. said: what has been announced since the last loop ended. idle: what happens between two
+    phases, and since when. heard: when the last line was written, s (monotonic), None before the first one.
     depths: of each thread, how deep it is in JAX's compiler; None before anybody listens. bar: the one on the terminal.
     """
 
     def __init__(self) -> None:
         self.phases: list[_Phase] = []
         self.said: set[str] = set()
-        self.heard = time.monotonic()
+        self.idle = _Phase("starting", time.monotonic())
+        self.heard: float | None = None
         self.depths: dict[int, int] | None = None
         self.bar: Progress | None = None
         self.silent = False
@@ -46,19 +48,16 @@ class _Voice:
             self.said.add(words)
             say(f"{words} ({usual})" if usual else words)
 
-    def still(self, start: _Phase, cpu: float) -> None:
-        """What goes on is said again after some silence. start: what goes on before anything has been announced.
-
-        cpu: seconds of this process since then.
-        """
-        phase, now = (self.phases or [start])[-1], time.monotonic()
+    def still(self, cpu: float) -> None:
+        """What goes on is said again after some silence. cpu: seconds of this process so far."""
+        phase, now = (self.phases or [self.idle])[-1], time.monotonic()
         lasts = now - phase.begun
-        if not self.said and (cpu > _FIRST or lasts > _AGAIN):
-            self.announce(start.words, "some seconds")
-        elif self.said and now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
-            words = phase.words if self.phases or self.said == {start.words} else "working"  # between two phases
+        if self.heard is None:
+            if cpu > _FIRST or lasts > _AGAIN:
+                self.announce(phase.words, "some seconds")
+        elif now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
             compiling = ", compiling" if any((self.depths or {}).values()) else ""
-            say(f"still {words} ({_duration(lasts)} so far{compiling})" if lasts >= 1 else words)
+            say(f"still {phase.words} ({_duration(lasts)} so far{compiling})" if lasts >= 1 else phase.words)
 
     def listen(self) -> None:
         """Hears from JAX, once it is imported, when it compiles."""
@@ -107,6 +106,7 @@ def doing(words: str, about: float | None = None, *, once: bool = False) -> Iter
         yield
     finally:
         _VOICE.phases.pop()
+        _VOICE.idle = _Phase("working", time.monotonic())
 
 
 @contextlib.contextmanager
@@ -115,12 +115,13 @@ def never_silent() -> Iterator[None]:
 
     That is after ten seconds, then more seldom, at last every half a minute.
     """
-    start, cpu, over = _Phase("starting", time.monotonic()), time.process_time(), threading.Event()
+    over, cpu = threading.Event(), time.process_time()
     _VOICE.said.clear()
+    _VOICE.idle, _VOICE.heard = _Phase("starting", time.monotonic()), None
 
     def watch() -> None:
         while not over.wait(0.5):
-            _VOICE.still(start, time.process_time() - cpu)
+            _VOICE.still(time.process_time() - cpu)
 
     watcher = threading.Thread(target=watch, name="never silent", daemon=True)
     watcher.start()
@@ -178,6 +179,7 @@ class RunProgress:
         if self._live is not None:
             self._live.stop()
         self._live = _VOICE.bar = None
+        _VOICE.said.clear()  # what comes next may be another run
 
     def advance(self, amount: int, info: Mapping[str, float] | None = None) -> None:
         """Count `amount` more units; `info` is shown behind them, by name."""
