@@ -65,7 +65,7 @@ class PretrainConfig(checks.Checked):
     """Transitions kept; new ones replace the oldest."""
     random_transitions: checks.Count = 500_000
     """Transitions under random actions, collected first: they give the observation statistics and a part of every
-    batch."""
+    batch. Where an environment would make more than 3,125 steps, a multiple of n-envs collects them."""
     random_fraction: checks.BelowOne = 0.5
     """Share of each batch that comes from the random actions (paper: 0.5)."""
     random_ladder: checks.Share = 0.0
