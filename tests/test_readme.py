@@ -18,7 +18,7 @@ ROW = re.compile(r"^\| `([\w-]+)` \| ([\d/]+) \| ([\d/]+) \| ([\d/]+) \| (\d+) \
 PRIORS = ("robust", "informed", "recurrent", "robust-tdmpc2")
 
 
-@pytest.mark.slow  # .ci/run runs it
+@pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_all_of_it_runs_as_pasted_in_a_fresh_clone(tmp_path):
     """But for `make setup`, which .ci/run tries in a fresh clone: here a link to this environment stands for it."""
