@@ -29,4 +29,4 @@ class Config(sac.Config):
 
 
 _ABOUT = "recommended: SAC in identified commands, half simulated, deployed by a guard"
-METHOD = Method("guarded", Online("sgft", _ABOUT, "ours", Config, sac.build))
+METHOD = Method("guarded", Online("model-free", _ABOUT, "ours", Config, sac.build))
