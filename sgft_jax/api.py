@@ -29,7 +29,7 @@ from sgft_jax.systems.simulated import Simulated, System
 from sgft_jax.train.finetuning import FinetuneProgress
 from sgft_jax.train.options import card_of
 from sgft_jax.train.simulation import SimulatedRows, simulate
-from sgft_jax.types import Finetuner, Online, Prior
+from sgft_jax.types import Finetuner, Online, Prior, Simulation
 
 __all__ = ["ActingPolicy", "Setup", "evaluate_prior", "finetuned_priors", "load_policy", "make_env", "setup"]
 
@@ -61,6 +61,7 @@ def setup(
     method: str = DEFAULT,
     seeds: int | Sequence[int] = 1,
     config: Any = None,
+    rows: Callable[[Simulation, Callable[[], SimulatedRows]], SimulatedRows] = lambda needs, collect: collect(),
     **options: Any,
 ) -> Setup:
     """Fine-tuning of seeds on real systems, ready to run.
@@ -68,7 +69,7 @@ def setup(
     real: gaps, which are simulated, or one `System`, such as `Gymnasium`, with a member for each seed.
     priors: one or P of them, or [] to learn from nothing where the method can; seed s starts from prior s modulo P.
     method: a name, or a Python file. seeds: how many, or a list of them. options: of the method, by name; config: all
-    of them as one object instead.
+    of them as one object instead. rows(needs, collect) -> what `collect()` returns, perhaps kept from an earlier run.
     Raises UserError for a prior of another algorithm or task, for a missing prior, and for options that do not fit.
     """
     known = [priors] if isinstance(priors, Prior) else list(priors)
@@ -88,22 +89,22 @@ def setup(
         system = Simulated(scene, real_worlds(scene, gaps, jax.random.key(0)), which, gamma=gamma)
     stacked = stack([prior.params for prior in known]) if known else None
     members = jnp.tile(jnp.array(list(numbers), jnp.uint32), copies)
-    return Setup(finetuner, system, stacked, members, _simulated_rows(env, finetuner, known, stacked))
+    needs = finetuner.simulation
+    simulated = None if needs is None else rows(needs, lambda: _collected(env, needs, known, stacked))
+    return Setup(finetuner, system, stacked, members, simulated)
 
 
-def _simulated_rows(env: Env, finetuner: Finetuner, priors: list[Prior], stacked: PyTree) -> SimulatedRows | None:
-    """What every prior's policy does where it was trained, if the method asks for it; always the same.
+def _collected(env: Env, needs: Simulation, priors: list[Prior], stacked: PyTree) -> SimulatedRows:
+    """What every prior's policy does where it was trained; always the same.
 
     That is the task's own domain, or the system of the gap that the first card names.
     """
-    if finetuner.simulation is None:
-        return None
     key, card, gap = jax.random.key(_SIMULATION), priors[0].card, None
     if (named := card.get("gap")) is not None:
         gap = from_dict(env, named["name"], {part: named[part] for part in ("params", "effects", "scene")})
         env = real_env(env, [gap])
     worlds = training_worlds(env, gap, key, SIMULATED_WORLDS)
-    return simulate(env, make_policy(card, env), worlds, stacked, key, finetuner.simulation, gamma=card["gamma"])
+    return simulate(env, make_policy(card, env), worlds, stacked, key, needs, gamma=card["gamma"])
 
 
 def check_prior(prior: Prior, method: Online, env: Env) -> None:

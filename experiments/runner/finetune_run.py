@@ -18,6 +18,7 @@ from envs.gaps import Gap
 from envs.rollout import Episode
 from envs.types import PyTree
 from experiments.runner import cli, real_systems
+from experiments.runner.kept import kept_in, simulated_rows
 from experiments.runner.machines import reserve
 from experiments.runner.pictures import before_and_after
 from experiments.runner.progress import doing
@@ -72,10 +73,10 @@ def run(
             playing = real_systems.connect(env, args.real, args.set, **one_each)
             last.push(lambda error, *_: playing.close(over=error is None))
             members = seeds * len(args.real)
-        count = len(priors) * getattr(args.options, "simulated_transitions", 0)
-        rows = f" and {count:,} simulated transitions of the priors" if count else ""
-        with doing(f"making the real systems{rows}", 20 + count / 3_000 if count else 5):
-            setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
+        rows = functools.partial(simulated_rows, kept_in(args.task), env, priors)
+        with doing("making the real systems", 5):
+            how = {"method": args.method, "seeds": members, "config": args.options, "rows": rows}
+            setup = api.setup(env, playing, priors, **how)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         inputs = {
             "priors": [digest(prior) for prior in priors],

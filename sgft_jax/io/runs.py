@@ -118,8 +118,8 @@ def provenance() -> dict[str, Any]:
     words = [plain_path(word, [Path.cwd(), ROOT]) for word in sys.argv[1:]]
     command, started = shlex.join([Path(sys.argv[0]).name, *words]), datetime.now(UTC).isoformat(timespec="seconds")
     devices = {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()}
-    versions = {"python": platform.python_version(), "versions": {name: _version(name) for name in _PACKAGES}}
-    return {"command": command, "started": started, "git": _git_state(ROOT), **versions, "device": devices}
+    code = {"git": _git_state(ROOT), "python": platform.python_version(), "versions": versions()}
+    return {"command": command, "started": started, **code, "device": devices}
 
 
 def plain_path(word: str, bases: Sequence[Path]) -> str:
@@ -134,6 +134,11 @@ def plain_path(word: str, bases: Sequence[Path]) -> str:
     option, path = absolute[1] or "", Path(absolute[2])
     inside = [path.relative_to(base) for base in bases if path.is_relative_to(base)]
     return option + (str(inside[0]) if inside else f".../{path.name}")
+
+
+def versions() -> dict[str, str]:
+    """Of this package and of those that decide its numbers."""
+    return {name: _version(name) for name in _PACKAGES}
 
 
 def _version(package: str) -> str:

@@ -4,7 +4,7 @@ A yielded state is valid until the iterator's next step, which donates its array
 """
 
 import functools
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
@@ -128,7 +128,14 @@ def evaluate(policy: Any, system: System, states: PyTree, seeds: Array, episodes
 
     policy, states: see `System.play`; for a `Finetuner` the states are `FinetuneProgress.agent`.
     """
+    if isinstance(states, Guarded):  # acts as what it exports: one program plays that and the best policies
+        policy, states = policy.policy, _exported(policy.export, states)
     return system.play(policy, states, _episode_keys(seeds, Finetuning.EVALUATE, 0, episodes), explore=False)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _exported(export: Callable[[PyTree], PyTree], states: PyTree) -> PyTree:
+    return jax.vmap(export)(states)
 
 
 def begin(
