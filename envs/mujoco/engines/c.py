@@ -14,6 +14,7 @@ import functools
 import os
 import threading
 import warnings
+from collections.abc import Callable
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -28,12 +29,16 @@ from envs.types import Array, PyTree
 
 
 class _Slot(NamedTuple):
-    """What a thread steps worlds in, one after another. views: name of an array -> the array inside `model`."""
+    """What a thread steps worlds in, one after another.
+
+    views: name of an array -> the array inside `model`. warmstart: that inside `data`.
+    """
 
     rollout: mujoco.rollout.Rollout
     model: mujoco.MjModel
     data: mujoco.MjData
     views: dict[str, np.ndarray]
+    warmstart: np.ndarray
 
 
 def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
@@ -55,7 +60,8 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     def new_slot() -> _Slot:
         model = copy.deepcopy(nominal)
         views = {name: attrgetter(name)(model) for name in arrays}
-        return _Slot(mujoco.rollout.Rollout(nthread=0), model, mujoco.MjData(model), views)
+        data = mujoco.MjData(model)
+        return _Slot(mujoco.rollout.Rollout(nthread=0), model, data, views, data.qacc_warmstart)
 
     slots = [new_slot() for _ in range(cores)]
 
@@ -63,23 +69,27 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
         lead = state.qpos.shape[:-1]
         worlds = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[len(lead) :]), (values, state, controls))
         values, state, controls = worlds
-        after = jax.tree.map(np.empty_like, state)
-        if host.nsensordata:
-            after = after._replace(sensordata=np.empty((len(controls), host.nsensordata), np.float32))
+        count, sensors = len(controls), np.empty((len(controls), host.nsensordata), np.float32)
+        # All at once into the precision of MuJoCo, and out of it; time comes first in its states.
+        moving = [np.zeros((count, 1)), state.qpos, state.qvel]
+        states, warmstarts = np.concatenate(moving, axis=1), state.warmstart.astype(np.float64)
+        exact = controls.astype(np.float64)
 
         def run(k: int) -> None:
-            slot = slots[k]
-            for i in range(k, len(controls), cores):
-                _enter(slot, {name: x[i] for name, x in values.items()})
-                now = jax.tree.map(lambda x, i=i: x[i], state)
-                sensed = _steps(slot, now, controls[i]) if move else _forward(slot, now, controls[i])
-                after.qpos[i], after.qvel[i] = slot.data.qpos, slot.data.qvel
-                after.warmstart[i], after.ctrl[i] = slot.data.qacc_warmstart, controls[i, -1]
-                if host.nsensordata:
-                    after.sensordata[i] = sensed
+            slot, steps = slots[k], _Steps.of(controls.shape[1], states.shape[1], host.nsensordata)
+            enter = _entering(slot, values)
+            for i in range(k, count, cores):
+                enter(i)
+                (_steps if move else _forward)(slot, steps, states[i : i + 1], warmstarts[i : i + 1], exact[i : i + 1])
+                states[i], sensors[i], warmstarts[i] = steps.states[0, -1], steps.sensors[0, -1], slot.warmstart
+                if not np.isfinite(states[i]).all():
+                    mujoco.mj_resetData(slot.model, slot.data)  # what explodes here reaches no other world
 
         with lock:
-            list(threads.map(run, range(min(cores, len(controls)))))
+            list(threads.map(run, range(min(cores, count))))
+        qpos, qvel = np.split(states[:, 1:].astype(np.float32), [host.nq], axis=1)
+        after = state._replace(qpos=qpos, qvel=qvel, warmstart=warmstarts.astype(np.float32), ctrl=controls[:, -1])
+        after = after._replace(sensordata=sensors) if host.nsensordata else after
         return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), after)
 
     def call(values: dict[str, Array], state: PyTree, controls: Array, *, move: bool) -> PyTree:
@@ -109,37 +119,44 @@ def _warn(message: str) -> None:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
-def _enter(slot: _Slot, values: dict[str, np.ndarray]) -> None:
-    """Make the slot's model that of one world."""
-    for name, value in values.items():
-        if name in slot.views:
-            slot.views[name][...] = value
-        else:
-            part, _, last = name.rpartition(".")
-            setattr(getattr(slot.model, part), last, float(value))
+class _Steps(NamedTuple):
+    """What the steps of one world lead to. states: [1, steps, 1 + nq + nv]. sensors: [1, steps, nsensordata]."""
+
+    states: np.ndarray
+    sensors: np.ndarray
+
+    @classmethod
+    def of(cls, steps: int, size: int, sensors: int) -> "_Steps":
+        """Blank ones."""
+        return cls(np.empty((1, steps, size)), np.empty((1, steps, sensors)))
 
 
-def _forward(slot: _Slot, state: Any, controls: np.ndarray) -> np.ndarray:
-    """[nsensordata] what the sensors read in that state under controls [1, nu]."""
-    data = slot.data
-    mujoco.mj_resetData(slot.model, data)
-    data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state.qpos, state.qvel, state.warmstart
-    data.ctrl[:] = controls[0]
-    mujoco.mj_forward(slot.model, data)
-    return data.sensordata
+def _entering(slot: _Slot, values: dict[str, np.ndarray]) -> Callable[[int], None]:
+    """(i) makes the slot's model that of the i-th of these worlds."""
+    arrays = [(slot.views[name], column) for name, column in values.items() if name in slot.views]
+    numbers = [(name.rpartition("."), column) for name, column in values.items() if name not in slot.views]
+    owners = [(getattr(slot.model, part), last, column) for (part, _, last), column in numbers]
+
+    def enter(i: int) -> None:
+        for view, column in arrays:
+            view[...] = column[i]
+        for owner, last, column in owners:
+            setattr(owner, last, float(column[i]))
+
+    return enter
 
 
-def _steps(slot: _Slot, state: Any, controls: np.ndarray) -> np.ndarray:
-    """All steps under `controls` [substeps, nu], in one call that leaves Python's lock to the other threads.
+def _forward(slot: _Slot, steps: _Steps, state: np.ndarray, warmstart: np.ndarray, controls: np.ndarray) -> None:
+    """What the sensors read in that state [1, ...] under controls [1, 1, nu]; the state stays."""
+    mujoco.mj_resetData(slot.model, slot.data)
+    mujoco.mj_setState(slot.model, slot.data, state[0], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    slot.data.ctrl[:], slot.warmstart[:] = controls[0, 0], warmstart[0]
+    mujoco.mj_forward(slot.model, slot.data)
+    steps.states[0, -1], steps.sensors[0, -1] = state[0], slot.data.sensordata
 
-    Returns [nsensordata], what the sensors read in the last one.
-    """
-    model, data = slot.model, slot.data
-    mujoco.mj_resetData(model, data)
-    start = np.concatenate([[0.0], state.qpos, state.qvel])  # time comes first
-    rolled, sensed = np.empty((1, len(controls), len(start))), np.empty((1, len(controls), model.nsensordata))
-    controls, warmstart = (x[None].astype(np.float64) for x in (controls, state.warmstart))
-    results = {"state": rolled, "sensordata": sensed}
-    steps = {"nstep": controls.shape[1], "initial_warmstart": warmstart}
-    slot.rollout.rollout([model], [data], start[None], controls, skip_checks=True, **steps, **results)
-    return sensed[0, -1]
+
+def _steps(slot: _Slot, steps: _Steps, state: np.ndarray, warmstart: np.ndarray, controls: np.ndarray) -> None:
+    """All steps under `controls` [1, steps, nu], in one call that leaves Python's lock to the other threads."""
+    results = {"state": steps.states, "sensordata": steps.sensors}
+    how = {"nstep": controls.shape[1], "initial_warmstart": warmstart, "skip_checks": True}
+    slot.rollout.rollout([slot.model], [slot.data], state, controls, **how, **results)
