@@ -157,6 +157,14 @@ def _forward(slot: _Slot, steps: _Steps, state: np.ndarray, warmstart: np.ndarra
 
 def _steps(slot: _Slot, steps: _Steps, state: np.ndarray, warmstart: np.ndarray, controls: np.ndarray) -> None:
     """All steps under `controls` [1, steps, nu], in one call that leaves Python's lock to the other threads."""
-    results = {"state": steps.states, "sensordata": steps.sensors}
-    how = {"nstep": controls.shape[1], "initial_warmstart": warmstart, "skip_checks": True}
-    slot.rollout.rollout([slot.model], [slot.data], state, controls, **how, **results)
+    slot.rollout.rollout(
+        [slot.model],
+        [slot.data],
+        state,
+        controls,
+        skip_checks=True,
+        nstep=controls.shape[1],
+        initial_warmstart=warmstart,
+        state=steps.states,
+        sensordata=steps.sensors,
+    )
