@@ -154,7 +154,7 @@ def test_the_phases_of_every_command():
         "evaluate": {"building ... worlds for each system", "playing ... episodes for each policy"},
         "export": {"exporting to ... and comparing actions"},
         "finetune_run": {
-            "making the real systems...",
+            "making the real systems",
             "preparing the agents",
             "learning from simulated transitions",
             "playing the first rollout and compiling what learns from it",
@@ -163,6 +163,7 @@ def test_the_phases_of_every_command():
         },
         "gaps_run": {"playing ... episodes on each real system", "building the worlds and compiling the training"},
         "hybrid_run": {"building the worlds"},
+        "kept": {"collecting ... simulated transitions of the priors"},
         "pictures": {"rendering a video"},
         "pretrain_run": {
             "building ... worlds",
