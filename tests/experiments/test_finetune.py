@@ -157,8 +157,8 @@ def explored(monkeypatch):
 def complaint(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         finetune.main(arguments)
-    error = capsys.readouterr().err
-    assert stopped.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1
+    *phases, error = capsys.readouterr().err.splitlines()
+    assert stopped.value.code == 2 and error.startswith("error: ") and "error" not in "".join(phases).lower()
     return error
 
 
@@ -528,9 +528,7 @@ def test_a_bad_command_is_one_line_and_code_2(home, tmp_path, more, words, capsy
 
 @pytest.mark.slow
 def test_training_that_diverges_stops_in_one_line(home, tmp_path, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        finetune.main([*argv(home, "sac", out=tmp_path), "--options.lr-critic", "1e30"])
-    error = capsys.readouterr().err.splitlines()[-1]
+    error = complaint([*argv(home, "sac", out=tmp_path), "--options.lr-critic", "1e30"], capsys)
     assert "training has diverged: " in error and "is not finite after 2 rollouts; there is no checkpoint" in error
     folder = tmp_path / "finetune/toy/turned/sac/seeds-0-1"
     assert len(RealStore(folder)) == 2 and not (folder / "metrics.jsonl").exists()

@@ -84,8 +84,8 @@ def finished(out):
 def complaint(argv, capsys):
     with pytest.raises(SystemExit) as stopped:
         pretrain.main(argv)
-    error = capsys.readouterr().err
-    assert stopped.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1
+    *phases, error = capsys.readouterr().err.splitlines()
+    assert stopped.value.code == 2 and error.startswith("error: ") and "error" not in "".join(phases).lower()
     return error
 
 
@@ -305,9 +305,7 @@ def test_out_that_is_a_file_is_one_line(capsys, tmp_path):
 @pytest.mark.slow
 def test_training_that_diverges_stops_in_one_line_and_a_failed_start_blocks_nobody(capsys, tmp_path, monkeypatch):
     argv = [*TINY, "--config.env-steps", "2560", "--out", str(tmp_path)]
-    with pytest.raises(SystemExit, match="2"):
-        pretrain.main([*argv, "--config.lr", "1e30"])
-    said = capsys.readouterr().err.splitlines()[-1]
+    said = complaint([*argv, "--config.lr", "1e30"], capsys)
     assert "training has diverged: " in said and "is not finite after 1,280 env steps; there is no checkpoint" in said
     (lines,) = (read_jsonl(path) for path in tmp_path.rglob("metrics.jsonl"))
     assert len(lines) == 1
