@@ -191,6 +191,8 @@ def _plain(tree: PyTree) -> PyTree:
         return {name: _plain(part) for name, part in tree.items()}
     if tree is None:
         return {}
+    if isinstance(tree, np.generic):  # what NumPy makes of a number of an array
+        return np.asarray(tree)
     if not isinstance(tree, (jax.Array, np.ndarray)):
         raise TypeError("prior parameters must be NamedTuples and dicts of arrays")
     return tree
