@@ -95,6 +95,23 @@ def test_processes_compile_the_same_worlds(monkeypatch):
     assert calls[1] is None
 
 
+@pytest.mark.heavy
+def test_worlds_are_those_of_the_code_that_runs_here(monkeypatch):
+    """A process that has imported other code, as from a file that has changed since, is not believed."""
+    env = make_env(SCENES["push"], "c")
+    theta = uniform(env).sample((), jax.random.key(0), 7)
+    here = env.make_worlds(theta)
+
+    def in_parallel(share, tasks, keep):
+        first, second = (share(*task) for task in tasks)
+        return [first, {name: field + 1 for name, field in second.items()}]
+
+    monkeypatch.setattr(physics, "WORTH", 3)
+    monkeypatch.setattr(physics.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(physics, "in_parallel", in_parallel)
+    chex.assert_trees_all_equal(env.make_worlds(theta), here)
+
+
 def test_what_mujoco_refuses_is_one_line():
     env = make_env(SCENES["push"], "c")
     theta = uniform(env).sample((), jax.random.key(0), 1)
