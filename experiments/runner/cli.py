@@ -78,6 +78,8 @@ def run_main[T](
                 main(config)
         except KeyboardInterrupt as stopped:
             number = getattr(stopped, "number", signal.SIGINT)
+            if progress.compiling():  # in threads that Python would wait for
+                _end_now(number, _farewell(number, config_type))
             progress.say(_farewell(number, config_type))
             sys.exit(128 + number)
         except UserError as error:

@@ -56,8 +56,8 @@ class _Voice:
             if cpu > _FIRST or lasts > _AGAIN:
                 self.announce(phase.words, "some seconds")
         elif now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
-            compiling = ", compiling" if any((self.depths or {}).values()) else ""
-            say(f"still {phase.words} ({_duration(lasts)} so far{compiling})" if lasts >= 1 else phase.words)
+            more = ", compiling" if compiling() else ""
+            say(f"still {phase.words} ({_duration(lasts)} so far{more})" if lasts >= 1 else phase.words)
 
     def listen(self) -> None:
         """Hears from JAX, once it is imported, when it compiles."""
@@ -130,6 +130,11 @@ def never_silent() -> Iterator[None]:
     finally:
         over.set()
         watcher.join()
+
+
+def compiling() -> bool:
+    """Whether JAX compiles now, in any thread."""
+    return any((_VOICE.depths or {}).values())
 
 
 def phase() -> str:

@@ -140,7 +140,8 @@ def test_a_run_says_what_it_is_doing(short, out):
     words, first = (out / "short/words").read_text().splitlines(), {}
     for line in words:
         first.setdefault(line.partition(" (")[0], line)
-    assert [line for line in first.values() if not line.startswith("still ") and "starting" not in line] == [
+    begun = [line for line in first.values() if not line.startswith(("still ", "starting", "working"))]
+    assert begun == [
         "building 32 worlds (about 3 s)",
         "compiling the training (about 30 s, once)",
         "collecting 2,048 random transitions (about 15 s, once)",
