@@ -20,6 +20,7 @@ class _Plan(Struct, forbid_unknown_fields=True):
 
 class _SACCard(Card):
     network: NetworkEntry
+    critic_network: NotRequired[NetworkEntry | None]
     plan: NotRequired[_Plan | None]
 
 
@@ -39,7 +40,8 @@ def _networks(card: Mapping[str, Any], params: Any) -> Networks:
     sizes, network = (card["obs_dim"], card["act_dim"]), network_of(card)
     yield "actor", networks.make_actor(*sizes, network), params.actor
     if params.critic is not None:
-        yield "critic", networks.make_critic(*sizes, network, members=_members(params.critic)), params.critic
+        twin = networks.make_critic(*sizes, network_of(card, "critic_network"), members=_members(params.critic))
+        yield "critic", twin, params.critic
     if params.value is not None:
         yield "value", networks.make_value(sizes[0], network), params.value
     if params.dynamics is not None:

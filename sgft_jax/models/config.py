@@ -31,13 +31,17 @@ class NetworkConfig(checks.Checked):
             raise UserError(unknown("activation", self.activation, known))
 
 
-def network_of(card: Mapping[str, Any]) -> NetworkConfig:
-    """The networks of a prior of SAC; raises UserError where this version knows no such network."""
+def network_of(card: Mapping[str, Any], name: str = "network") -> NetworkConfig:
+    """The networks of a prior of SAC; raises UserError where this version knows no such network.
+
+    name: "critic_network" for its critic's, which are the same where the card says nothing else.
+    """
+    described = card.get(name) or card["network"]
     try:
-        fields: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
+        fields: dict[str, Any] = {**described, "hidden": tuple(described["hidden"])}
         return NetworkConfig(**fields)
     except (TypeError, KeyError):
-        raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
+        raise UserError(f"this version knows no such network: {described}; pretrain again") from None
 
 
 def two_layers() -> NetworkConfig:

@@ -15,6 +15,7 @@ import optax
 
 from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.data import replay, sources
+from sgft_jax.files.disk import jsonable
 from sgft_jax.learners import sac
 from sgft_jax.math import optim
 from sgft_jax.models import dynamics, value
@@ -336,6 +337,7 @@ def sac_finetuner(
         interface=command_interface(network, task) if identifies else None,
         beginner=simulator_actor if fresh and prior is not None else None,
         simulation=simulation,
+        card={"critic_network": config.critic_network and jsonable(config.critic_network)},
     )
     return assemble(parts, options, task)
 

@@ -91,6 +91,18 @@ def test_what_a_prior_does_not_have_is_none(tmp_path):
     assert bits(loaded) == bits(params._replace(value=None))
 
 
+def test_a_critic_may_have_networks_of_its_own(tmp_path):
+    """As that of `rlpd` has, which its fine-tuned policies keep."""
+    wide = NetworkConfig(hidden=(5,), layer_norm=True)
+    prior = make_prior(critic_network=jsonable(wide))
+    wider = Prior(prior.params._replace(critic=of_sac(wide).critic), prior.card)
+    priors.save_prior(tmp_path / "wide", wider)
+    jax.tree.map(np.testing.assert_array_equal, priors.load_prior(tmp_path / "wide").params, wider.params)
+    priors.save_prior(tmp_path / "lies", Prior(wider.params, CARD))
+    with pytest.raises(UserError, match=r"critic.* has shape .*5.*, expected .*3.* for its card"):
+        priors.load_prior(tmp_path / "lies")
+
+
 def test_saving_a_prior_again_replaces_it(tmp_path):
     save(tmp_path / "prior", 1.0)
     save(tmp_path / "prior", 3.0)
@@ -173,6 +185,7 @@ LIES = {
     "width a text": {"network": {"hidden": ["3"]}},
     "widths a number": {"network": {"hidden": 3}},
     "another width": {"network": {"hidden": [4]}},
+    "critic of another width": {"critic_network": {"hidden": [4]}},
     "another depth": {"network": {"hidden": [3, 3]}},
     "layer norm": {"network": BODY | {"layer_norm": True}},
     "layer norm a text": {"network": BODY | {"layer_norm": "yes"}},
