@@ -242,22 +242,25 @@ def test_random_actions_grow_along_the_fleet(key, monkeypatch):
     assert obeyed[0] == 1 and obeyed[2] == 0 and 0.25 < obeyed[1] < 0.75
 
 
+def shapes_of_random(env, config):
+    """Of what one member collects under random actions."""
+    worlds = pretraining.training_pools(env, replace(config, worlds=1), [0])(0)
+    return pretraining.make_programs(env, config, 1).collect.eval_shape(worlds, jax.random.split(jax.random.key(0), 1))
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_random_actions_that_would_take_hours_come_from_more_simulators(preset, monkeypatch):
     """25 million transitions are 3,125 steps of 8,000 simulators. Those of other presets are too few for that."""
     config, env, launched, launch = PRESETS[preset], toy.make(), [], pretraining.launch
     monkeypatch.setattr(pretraining, "launch", lambda *args: launched.append(args[3]) or launch(*args))
-    worlds = pretraining.training_pools(env, replace(config, worlds=1), [0])(0)
-    kept = jax.eval_shape(functools.partial(pretraining.collect_random, env, config, [0]), worlds)
+    kept = shapes_of_random(env, config)
     assert launched == [8_000 if preset == "paper" else config.n_envs]
     assert jax.tree.leaves(kept)[0].shape[1] in (config.random_transitions, config.random_transitions + launched[0])
 
 
 def test_a_ring_of_time_slots_keeps_to_the_simulators_of_training():
     config = replace(CONFIG, algorithm="tdmpc2", n_envs=2, random_transitions=2 * 4_000)
-    env = toy.make()
-    worlds = pretraining.training_pools(env, config, [0])(0)
-    assert jax.eval_shape(functools.partial(pretraining.collect_random, env, config, [0]), worlds).n_envs == 2
+    assert shapes_of_random(toy.make(), config).n_envs == 2
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])

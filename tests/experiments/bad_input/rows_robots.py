@@ -87,7 +87,7 @@ ROWS = [
     ("benchmark --parts finetune", "--parts finetune needs --prior FOLDER, as made by python -m experiments.pretrain"),
     ("benchmark --parts finetune --prior nowhere", "--prior nowhere: no such folder"),
     ("benchmark --parts system --prior prior --tasks hammer", "prior: is a prior of the task 'push', not of 'hammer'"),
-    ("benchmark --parts pretrain --env-steps 0", "--env-steps is 0: must be at least 1"),
+    ("benchmark --parts startup --env-steps 0", "--env-steps is 0: must be at least 1"),
     ("benchmark --rollouts 0", "--rollouts is 0: must be at least 1"),
     ("benchmark --out file", "file is a file"),
     ("benchmark --out loop", "loop is a link that leads nowhere"),
