@@ -50,6 +50,11 @@ class _Process:
         return self._process.poll() is None
 
 
+def cores() -> int:
+    """How many this process may use, where the system tells, or else has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 _KEPT: list[_Process] = []
 _STARTING = threading.Lock()
 os.register_at_fork(after_in_child=_KEPT.clear)  # they serve one process

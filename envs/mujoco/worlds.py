@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from envs.mujoco.engines import CARRIED, Engine, carried, comparison
-from envs.mujoco.processes import in_parallel
+from envs.mujoco.processes import cores, in_parallel
 from envs.types import Array, UserError, brief, unknown
 
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
@@ -116,7 +116,7 @@ def compile_worlds(
     Raises UserError when MuJoCo refuses a spec, or when one differs from the nominal scene in anything else that a step
     reads: in its structure, which a compiled program cannot follow, or in what was the same in `varying_fields`.
     """
-    count, parts = min(os.cpu_count() or 1, len(thetas) // WORTH), None
+    count, parts = min(cores(), len(thetas) // WORTH), None
     if count > 1:
         shares = [thetas[len(thetas) * i // count : len(thetas) * (i + 1) // count] for i in range(count)]
         parts = in_parallel(_share, [(build, theta, share, names) for share in shares], keep=True)

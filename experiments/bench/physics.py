@@ -7,7 +7,6 @@ follow the commands they gave, in the nominal scene, so all of them meet the sam
 
 import functools
 import gc
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from mujoco import mjx
 import envs
 from envs.base import Env, World
 from envs.mujoco.engines import warp as engine_warp
+from envs.mujoco.processes import cores
 from envs.mujoco.worlds import Impl, PhysicsState, choose_impl
 from envs.rollout import Fleet, launch, step_fleet
 from envs.types import Array, Key
@@ -173,7 +173,6 @@ def _c_alone(host: mujoco.MjModel, window: Window, substeps: int, repeats: int) 
     qpos, qvel, warmstart = (np.asarray(x, np.float64) for x in window.start[:3])
     state = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)  # time comes first
     control = np.repeat(np.asarray(window.commands, np.float64).swapaxes(0, 1), substeps, axis=1)
-    cores = os.cpu_count() or 1
-    with mujoco.rollout.Rollout(nthread=cores) as pool:
-        data = [mujoco.MjData(host) for _ in range(cores)]
+    with mujoco.rollout.Rollout(nthread=cores()) as pool:
+        data = [mujoco.MjData(host) for _ in range(cores())]
         return fastest(lambda: pool.rollout(host, data, state, control, initial_warmstart=warmstart), repeats=repeats)

@@ -47,7 +47,7 @@ def simulated_rows(
     """
     facts = "" if folder is None else json.dumps(_facts(env, priors, needs), sort_keys=True)
     path = folder and folder / f"{hashlib.sha256(facts.encode()).hexdigest()[:24]}.npz"
-    if path and path.exists():
+    if path and os.path.exists(path):  # False, too, in a folder that may not be searched
         try:
             return _read(path, facts)
         except UserError as error:

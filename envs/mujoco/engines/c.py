@@ -11,7 +11,6 @@ JAX arrays of its arguments, and the copies wait for threads that may all be bus
 import concurrent.futures
 import copy
 import functools
-import os
 import threading
 import warnings
 from collections.abc import Callable
@@ -25,6 +24,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from envs.mujoco.engines import Engine
+from envs.mujoco.processes import cores
 from envs.types import Array, PyTree
 
 
@@ -53,8 +53,8 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     if {"geom_size", "geom_pos", "geom_quat", "body_ipos", "body_iquat"}.intersection(fields):
         nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE  # its boxes are those of the nominal scene
     arrays = tuple(name for name in fields if isinstance(attrgetter(name)(nominal), np.ndarray))
-    cores = os.cpu_count() or 1
-    threads = concurrent.futures.ThreadPoolExecutor(cores)
+    lanes = cores()
+    threads = concurrent.futures.ThreadPoolExecutor(lanes)
     lock = threading.Lock()  # XLA may run two programs at once
 
     def new_slot() -> _Slot:
@@ -63,7 +63,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
         data = mujoco.MjData(model)
         return _Slot(mujoco.rollout.Rollout(nthread=0), model, data, views, data.qacc_warmstart)
 
-    slots = [new_slot() for _ in range(cores)]
+    slots = [new_slot() for _ in range(lanes)]
 
     def on_host(values: dict[str, Any], state: Any, controls: Any, *, move: bool) -> Any:
         lead = state.qpos.shape[:-1]
@@ -78,7 +78,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
         def run(k: int) -> None:
             slot, steps = slots[k], _Steps.of(controls.shape[1], states.shape[1], host.nsensordata)
             enter = _entering(slot, values)
-            for i in range(k, count, cores):
+            for i in range(k, count, lanes):
                 enter(i)
                 (_steps if move else _forward)(slot, steps, states[i : i + 1], warmstarts[i : i + 1], exact[i : i + 1])
                 states[i], sensors[i], warmstarts[i] = steps.states[0, -1], steps.sensors[0, -1], slot.warmstart
@@ -86,7 +86,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
                     mujoco.mj_resetData(slot.model, slot.data)  # what explodes here reaches no other world
 
         with lock:
-            list(threads.map(run, range(min(cores, count))))
+            list(threads.map(run, range(min(lanes, count))))
         qpos, qvel = np.split(states[:, 1:].astype(np.float32), [host.nq], axis=1)
         after = state._replace(qpos=qpos, qvel=qvel, warmstart=warmstarts.astype(np.float32), ctrl=controls[:, -1])
         after = after._replace(sensordata=sensors) if host.nsensordata else after

@@ -8,7 +8,6 @@ the worlds' own, so it never has to be captured again.
 
 import contextlib
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -18,7 +17,7 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
 from envs.mujoco.engines import FLUID
-from envs.mujoco.processes import in_parallel
+from envs.mujoco.processes import cores, in_parallel
 from envs.types import Array, UserError
 
 wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads
@@ -182,7 +181,7 @@ def compile_kernels(host: mujoco.MjModel, layout: Sequence[str], **size: int) ->
     during which XLA, which waits for the step, tries no kernels of other programs either.
     """
     if wp.is_cuda_available():
-        count = min(os.cpu_count() or 1, _PROCESSES)
+        count = min(cores(), _PROCESSES)
         in_parallel(_compile_share, [(host, layout, size, i, count) for i in range(count)], keep=False)
 
 

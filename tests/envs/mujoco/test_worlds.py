@@ -87,7 +87,7 @@ def test_processes_compile_the_same_worlds(monkeypatch):
 
     monkeypatch.setattr(physics, "WORTH", 3)
     monkeypatch.setattr(physics, "in_parallel", in_parallel)
-    monkeypatch.setattr(physics.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(physics, "cores", lambda: 2)
     chex.assert_trees_all_equal(env.make_worlds(theta), here)
     assert [len(part["body_mass"]) for part in calls[0]] == [3, 4]
     nameless = SCENES["push"]._replace(build=lambda theta: SCENES["push"].build(theta))
@@ -107,7 +107,7 @@ def test_worlds_are_those_of_the_code_that_runs_here(monkeypatch):
         return [first, {name: field + 1 for name, field in second.items()}]
 
     monkeypatch.setattr(physics, "WORTH", 3)
-    monkeypatch.setattr(physics.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(physics, "cores", lambda: 2)
     monkeypatch.setattr(physics, "in_parallel", in_parallel)
     chex.assert_trees_all_equal(env.make_worlds(theta), here)
 
