@@ -65,7 +65,7 @@ def run_main[T](
     with 1 and no message if the reader of its output has gone, as after `| head`. Other exceptions are bugs and keep
     their traceback.
     """
-    with _may_lose_its_reader(), _stopped_by_signals(config_type):
+    with _may_lose_its_reader(), _stopped_by_signals(config_type) as signals:
         try:
             words = list(sys.argv[1:] if argv is None else argv)
             start = None if default is None else default(words)
@@ -77,14 +77,12 @@ def run_main[T](
             with progress.never_silent():
                 main(config)
         except KeyboardInterrupt as stopped:
-            number = getattr(stopped, "number", signal.SIGINT)
-            if progress.compiling():  # in threads that Python would wait for
-                _end_now(number, _farewell(number, config_type))
-            progress.say(_farewell(number, config_type))
-            sys.exit(128 + number)
+            _stop(getattr(stopped, "number", signal.SIGINT), config_type)
         except UserError as error:
             fail(str(error))
         except Exception as error:
+            if signals:  # raised in a function that JAX called, which makes an error of its own of it
+                _stop(signals[0], config_type)
             if reason := _disk_trouble(error):
                 again = _has_resume(config_type) and _in_a_run(error)
                 fail(f"{reason}; mend that, then {'the same command with --resume goes on' if again else 'try again'}")
@@ -97,6 +95,14 @@ def run_main[T](
                 raise
             reason = (str(error).strip() or "MemoryError").splitlines()[0]
             fail(f"out of memory ({reason}): lower the batch size, the number of environments or of seeds")
+
+
+def _stop(number: int, config_type: type) -> NoReturn:
+    """Ends the process after a signal."""
+    if progress.compiling():  # in threads that Python would wait for
+        _end_now(number, _farewell(number, config_type))
+    progress.say(_farewell(number, config_type))
+    sys.exit(128 + number)
 
 
 def _disk_trouble(error: BaseException | None) -> str | None:
@@ -127,22 +133,25 @@ def _in_renderer_choice(error: Exception) -> bool:
 
 
 @contextlib.contextmanager
-def _stopped_by_signals(config_type: type) -> Iterator[None]:
+def _stopped_by_signals(config_type: type) -> Iterator[list[int]]:
     """Ctrl-C, SIGTERM and SIGHUP raise `Stopped`, where nobody has said otherwise (as `nohup` does).
+
+    Yields the numbers of those that have come.
 
     The main thread hears nothing while it compiles or while a compiled program runs. The process then ends all the same
     after a second, unless a robot is at work; with a second signal it ends at once.
     """
-    heard = threading.Event()
+    heard, numbers = threading.Event(), list[int]()
 
     def stop(number: int, frame: object) -> NoReturn:
         heard.set()
+        numbers.append(number)
         raise Stopped(number)
 
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     asked = [number for number, handler in before.items() if handler in (signal.SIG_DFL, signal.default_int_handler)]
     if not asked or threading.current_thread() is not threading.main_thread():  # no other may handle signals
-        yield
+        yield numbers
         return
     pipe, tell = os.pipe()
     os.set_blocking(tell, False)
@@ -151,7 +160,7 @@ def _stopped_by_signals(config_type: type) -> Iterator[None]:
     for number in asked:
         signal.signal(number, stop)
     try:
-        yield
+        yield numbers
     finally:
         for number in asked:
             signal.signal(number, before[number])

@@ -222,7 +222,7 @@ def _worth(success: float, x: Inputs, c: Coefficients) -> str:
     points, after = 100 * gain(x, c), 100 * success_after(x, AHEAD, c)
     words = f"{points:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
     if success >= _SOLVED:
-        return f"fine-tuning: little to gain ({points:+.0f} points expected); keep the policy, or use a guarded method"
+        return f"fine-tuning: little to gain ({points:+.0f} points expected); keep the policy, or use sac"
     if points >= 100 * _WORTH:
         return f"fine-tuning: worth it, {words}"
     return f"fine-tuning: little hope ({words}); a simulator with what differs, see above, helps more"

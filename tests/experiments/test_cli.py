@@ -251,6 +251,17 @@ def test_signals_end_a_command_as_ctrl_c_does(name, code, word):
     assert "resume" not in said  # no run has begun
 
 
+@pytest.mark.parametrize(("name", "code", "word"), [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted")])
+def test_a_signal_in_a_function_that_jax_calls_is_no_fault_of_that(name, code, word):
+    """JAX makes an error of its own of what such a function raises, without a cause."""
+    ended, said = what_is_said(
+        f"try: os.kill(os.getpid(), signal.{name}); time.sleep(60)\n"
+        "    except KeyboardInterrupt as stopped: error = ValueError(f'INTERNAL: buffer callback: {stopped!r}')\n"
+        "    raise error"
+    )
+    assert (ended, said.split("\n")[1]) == (code, word) and "Traceback" not in said
+
+
 def in_c(name, times):
     """A program that works in C for minutes, as one that compiles, and gets that signal so many times meanwhile."""
     send = f"lambda: [(time.sleep(0.2), os.kill(os.getpid(), signal.{name})) for _ in range({times})]"
