@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+from envs.mujoco.processes import cores
+
 
 class Ahead:
     """Jitted programs that compile before they are called: a call then finds the compiled one in JAX's own cache.
@@ -34,7 +36,7 @@ class Ahead:
 @contextlib.contextmanager
 def compiling() -> Iterator[Ahead]:
     """Threads for a block; what has not begun when it is left, as by an error, never begins."""
-    threads = ThreadPoolExecutor(thread_name_prefix="compile")
+    threads = ThreadPoolExecutor(cores(), thread_name_prefix="compile")  # more would take memory alone
     try:
         yield Ahead(threads)
     finally:
