@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from envs.types import unknown
-from experiments.runner.cli import columns, fail
+from experiments.runner.cli import columns, fail, may_lose_its_reader
 
 _RUNS = 'if __name__ == "__main__":'  # what a command ends with
 
@@ -19,8 +19,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     """
     name, *words = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     if name in ("-h", "--help"):
-        print("usage: sgft COMMAND [OPTIONS]; sgft COMMAND --help lists the options\n")
-        print("\n".join(columns(list(commands().items()))))
+        with may_lose_its_reader():
+            print("usage: sgft COMMAND [OPTIONS]; sgft COMMAND --help lists the options\n")
+            print("\n".join(columns(list(commands().items()))))
         return
     if name not in (known := commands()):
         fail(unknown("command", name, known))

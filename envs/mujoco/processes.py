@@ -1,6 +1,7 @@
 """Impure: Python functions that work in several processes, because here one at a time holds Python's lock.
 
-`python -m envs.mujoco.processes` is one of them: it serves the process that has started it, and ends with that.
+`python -m envs.mujoco.processes` is one of them: it serves the process that has started it, and ends with that. They
+exchange pickles, which may run code, by a socket that no third process can reach.
 """
 
 import atexit

@@ -65,7 +65,7 @@ def run_main[T](
     with 1 and no message if the reader of its output has gone, as after `| head`. Other exceptions are bugs and keep
     their traceback.
     """
-    with _may_lose_its_reader(), _stopped_by_signals(config_type) as signals:
+    with may_lose_its_reader(), _stopped_by_signals(config_type) as signals:
         try:
             words = list(sys.argv[1:] if argv is None else argv)
             start = None if default is None else default(words)
@@ -228,7 +228,7 @@ def _quiet_threads() -> None:
 
 
 @contextlib.contextmanager
-def _may_lose_its_reader() -> Iterator[None]:
+def may_lose_its_reader() -> Iterator[None]:
     """Ends the process without a traceback if stdout is a pipe that is read no more."""
     try:
         try:

@@ -1,5 +1,7 @@
 """The list of commands, and running one by its name."""
 
+import os
+import subprocess
 import sys
 
 import pytest
@@ -60,3 +62,12 @@ def test_the_usage_is_what_was_typed(line, shown, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         commands.main(["tasks", "--help"])
     assert capsys.readouterr().out.startswith(shown)
+
+
+def test_the_list_may_lose_its_reader():
+    """As after `| head`."""
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([sys.executable, "-m", "experiments"], stdout=write, stderr=subprocess.PIPE)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (1, b"")
