@@ -29,8 +29,8 @@ def test_all_of_it_runs_as_pasted_in_a_fresh_clone(tmp_path):
     users = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "SGFT_IMPL")}
     environment = {**users, "JAX_PLATFORMS": "cpu", "URL": str(ROOT)}
     subprocess.run(["bash", "-ex", "-c", script], cwd=tmp_path, env=environment, check=True, timeout=3500)
-    left = {str(path.relative_to(tmp_path)) for path in tmp_path.glob("sgft_jax/runs/*")}
-    assert left >= {f"sgft_jax/runs/{name}" for name in ("demo", "finetune", "mine", "pretrain")}
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.glob("sgft-jax/runs/*")}
+    assert left >= {f"sgft-jax/runs/{name}" for name in ("demo", "finetune", "mine", "pretrain")}
 
 
 def test_the_table_is_what_the_released_data_say():

@@ -50,6 +50,8 @@ PAIRS = (
     *((name, "block") for name in ELBOW),
 )
 BOARD_THICKNESS = 0.06  # m
+DOME = 0.007  # m, of the head that is drawn
+_RED = [0.8, 0.15, 0.1, 1]
 NV = arm.N_JOINTS + 1
 
 PARAMETERS = (
@@ -138,6 +140,17 @@ def check(theta: dict[str, float]) -> str | None:
     return f"nail_z less twice nail_half_height is the board's height, {board:g} m: more than {BOARD_THICKNESS:g} m"
 
 
+def dress(spec: mujoco.MjSpec) -> None:
+    """The robot, and a red nail with a round head, which is also seen when it is driven: flat, it sinks to the board."""
+    arm.dress(spec)
+    nail = spec.body("nail")
+    for geom in nail.geoms[:2]:
+        geom.rgba = _RED
+    _, head, _ = nail.geoms
+    size, place = [head.size[0], head.size[0], DOME], [0, 0, 2 * head.size[1]]
+    nail.add_geom(type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=size, pos=place, rgba=_RED, mass=0, **parts.NO_CONTACT)
+
+
 SCENE = arm.scene(
     name="hammer",
     observation=(
@@ -161,7 +174,7 @@ SCENE = arm.scene(
     reward=reward,
     success=success,
     check=check,
-    dress=arm.dress,
+    dress=dress,
     view=View((0.36, 0.0, 0.58), 0.52, 65.0, -16.0, 0.0),
 )
 

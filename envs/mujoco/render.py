@@ -13,8 +13,7 @@ from envs.mujoco.parts import NO_CONTACT
 from envs.mujoco.scene import Scene, View
 from envs.types import UserError
 
-FPS = 10
-SPEED = 2  # times real time: a graphics library without a graphics card needs 0.2 s a frame
+FPS = 10  # in real time; a graphics library without a graphics card needs 0.1 s a frame
 SIZE = 360, 480  # height, width in pixels
 CAPTION = 52  # pixels, height of the strip above a captioned video
 JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, and nothing to draw in between
@@ -80,7 +79,7 @@ def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np
     camera = _camera(model, scene.view)
     renderer = _renderer(model)
     try:
-        for row in smooth(np.asarray(qpos), control_dt=scene.control_dt, fps=FPS / SPEED):
+        for row in smooth(np.asarray(qpos), control_dt=scene.control_dt, fps=FPS):
             data.qpos[:] = row
             if scene.view is not None and scene.view.follow:
                 _follow(model, data, scene.view, camera)
@@ -164,9 +163,9 @@ def _camera(model: mujoco.MjModel, view: View | None) -> mujoco.MjvCamera:
 
 
 def _shrink(image: np.ndarray) -> np.ndarray:
-    n = SUPERSAMPLING
-    blocks = image.reshape(SIZE[0], n, SIZE[1], n, 3).astype(np.uint16)
-    return (blocks.sum((1, 3)) // n**2).astype(np.uint8)
+    n, wide = SUPERSAMPLING, image.astype(np.uint16)
+    rows = sum(wide[i::n] for i in range(n))  # ten times faster than the sum over axes of blocks
+    return (sum(rows[:, i::n] for i in range(n)) // n**2).astype(np.uint8)
 
 
 def _caption(text: str) -> np.ndarray:

@@ -84,7 +84,7 @@ def _draw(env: Env, path: Path, render: Callable[[Any], None]) -> str:
         return f"no video: {reason}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with doing("rendering a video", 10):
+        with doing("rendering a video", 15):
             render(scene)
     except Exception as error:  # whatever a graphics driver or a video encoder raises
         return f"no video: {(str(error).strip() or type(error).__name__).splitlines()[0]}"

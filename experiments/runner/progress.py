@@ -171,8 +171,10 @@ class RunProgress:
     def __enter__(self) -> Self:
         if self._console.is_terminal:
             from rich.progress import BarColumn, Progress, TextColumn
+            from rich.table import Column
 
-            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[words]}"))
+            title, words = (TextColumn(f"{{task.{x}}}", table_column=Column()) for x in ("description", "fields[words]"))
+            columns = (title, BarColumn(20), words)  # what does not fit beside the bar wraps
             self._live = Progress(*columns, console=self._console)
             self._live.start()
             _VOICE.bar = self._live

@@ -1,4 +1,4 @@
-"""The recommended method: SAC in the simulator's own commands, on half simulated batches, behind a guard.
+"""The default method: SAC in the simulator's own commands, on half simulated batches, behind a guard.
 
 What it is made of, each an option that other methods have too, and what it is for (docs/rules.md has the numbers):
 
@@ -28,5 +28,5 @@ class Config(sac.Config):
     guard: bool = True
 
 
-_ABOUT = "recommended: SAC in identified commands, half simulated, deployed by a guard"
+_ABOUT = "the default: SAC in identified commands, half simulated, deployed by a guard"
 METHOD = Method("guarded", Online("model-free", _ABOUT, "ours", Config, sac.build))

@@ -57,6 +57,14 @@ def test_live_bar_on_a_terminal():
     assert "40/100 transitions" in written and "success 0.5" in written
 
 
+def test_what_does_not_fit_beside_the_bar_wraps():
+    console = Console(file=io.StringIO(), width=100, height=20, force_terminal=True)
+    with RunProgress("finetune hammer", total=100, unit="transitions", console=console) as shown:
+        shown.advance(20)
+        shown.advance(40, {"success, exploring": 0.5, "success, evaluation": 0.25, "the last": 0.125})
+    assert "the last 0.125" in " ".join(console.file.getvalue().split())
+
+
 @pytest.mark.parametrize(
     ("seconds", "shown"), [(0, "0:00:00"), (59.6, "0:01:00"), (3661, "1:01:01"), (90000, "25:00:00")]
 )
