@@ -7,6 +7,7 @@ sorts these pairs by success before fine-tuning. For the second one rollouts of 
 chosen where enough of them fail; systems count alike. Falls: share of runs that were at any time 10 points below.
 """
 
+from itertools import pairwise
 from math import comb
 from pathlib import Path
 
@@ -28,7 +29,7 @@ def main() -> None:
     start, end, fall = np.concatenate(systems, axis=1)
     start, fell = start.mean(1), 100.0 * (fall > FALL)
     rows = []
-    for low, high in zip(STARTS[:-1], STARTS[1:], strict=True):
+    for low, high in pairwise(STARTS):
         inside = (start >= low) & (start < high)
         rows.append([f"{low} to {high - 1}", f"{inside.sum()}", *cells([*end[inside].mean(0), *fell[inside].mean(0)])])
     print(markdown(["start", "priors", *(f"{name}: {x}" for x in ("end", "fell") for name in METHODS)], rows))
@@ -62,6 +63,7 @@ def probability(n: int, failures: int, success: np.ndarray) -> np.ndarray:
 
 
 def cells(values: list[float]) -> list[str]:
+    """Whole numbers."""
     return [f"{value:.0f}" for value in values]
 
 

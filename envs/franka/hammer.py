@@ -141,12 +141,11 @@ def check(theta: dict[str, float]) -> str | None:
 
 
 def dress(spec: mujoco.MjSpec) -> None:
-    """The robot, and a red nail with a round head, which is also seen when it is driven: flat, it sinks to the board."""
+    """The robot, and a red nail with a round head: that one is seen when the flat one has sunk into the board."""
     arm.dress(spec)
     nail = spec.body("nail")
-    for geom in nail.geoms[:2]:
-        geom.rgba = _RED
-    _, head, _ = nail.geoms
+    stem, head, _ = nail.geoms
+    stem.rgba = head.rgba = _RED
     size, place = [head.size[0], head.size[0], DOME], [0, 0, 2 * head.size[1]]
     nail.add_geom(type=mujoco.mjtGeom.mjGEOM_ELLIPSOID, size=size, pos=place, rgba=_RED, mass=0, **parts.NO_CONTACT)
 

@@ -62,7 +62,7 @@ def test_dressing_leaves_motion_alone(name):
 
 @pytest.mark.parametrize("thickness", [0.001, 0.01])
 def test_a_driven_nail_is_seen(thickness):
-    """Its flat head has sunk to 1 mm below the board, where the hammer stopped; the drawn one stands out of the board."""
+    """Its flat head has sunk to 1 mm below the board, where the hammer stopped; the drawn one stands out."""
     theta = nominal(hammer.SCENE) | {"head_thickness": thickness}
     model = render.dressed(hammer.SCENE, theta).compile()
     data = mujoco.MjData(model)
