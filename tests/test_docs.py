@@ -50,8 +50,10 @@ def test_the_readme_has_commands():
     assert ["make", "setup"] in COMMANDS and ["make", "demo"] in COMMANDS and len(MODULES) >= 6
 
 
-def test_the_readme_is_short():
+def test_the_documentation_is_short():
     assert len(README.split()) <= 700
+    pages = [path.read_text() for path in (ROOT / "docs").rglob("*.md")]
+    assert len(" ".join(pages).split()) <= 24_000
 
 
 @pytest.mark.parametrize("words", [c for c in COMMANDS if c[0] == "make"], ids=" ".join)
