@@ -1,10 +1,10 @@
-"""The whole method at a small scale on a CPU: pretrain, meet a "real" system, fine-tune with and without SGFT."""
+"""The whole idea in two minutes on a CPU: a policy fails on a "real" system and is fine-tuned, with and without SGFT."""
 
 import contextlib
 import multiprocessing
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,14 +13,11 @@ from envs.files import read_json
 from envs.types import UserError
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune import finetune
-from experiments.pretrain import PretrainArgs, pretrain
-from experiments.pretrain import check as check_pretraining
 from experiments.runner import cli
-from experiments.runner.finetune_args import FinetuneArgs, arguments, check, run_folder
+from experiments.runner.finetune_args import FinetuneArgs, arguments, check, priors_of, run_folder
 from experiments.runner.options import check_task
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import get_method
-from sgft_jax.presets import PRESETS
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve
@@ -30,31 +27,31 @@ METHODS = ("sgft-mpc", "sgft-sac", "sac")  # the first is filmed
 
 @dataclass(frozen=True)
 class DemoArgs:
-    """A few minutes of the whole pipeline; everything lands in one folder."""
+    """Three methods from one prior on one real system; everything lands in one folder."""
 
     task: str = "insert"
-    """A task by name. On hammer and push, priors as small as these differ more than methods do (docs/results.md)."""
+    """A task by name."""
+    prior: Path = Path("shipped:insert-cpu")
+    """Folder of a prior. The default is what `pretrain --task insert --preset cpu` makes in two minutes: a weak one, from
+    which methods differ (docs/results.md)."""
     real: str = "default"
     """The real system, as in fine-tuning."""
     seeds: int = 3
     """Fine-tuning seeds per method."""
-    rollouts: int = 20
+    rollouts: int = 10
     """Real rollouts per seed, the initial ones included."""
     video: bool = True
     """Render an episode before and after fine-tuning with sgft-mpc, where MuJoCo can render."""
     out: Path = Path("runs/demo")
     """Folder of the demo; an earlier demo in it is replaced."""
-    env_steps: int | None = None
-    """Expert: environment steps of pretraining, default: those of preset `cpu`."""
 
 
 def main(args: DemoArgs) -> None:
-    """Pretrains once, fine-tunes with each method from the same prior on the same real starts, and compares."""
+    """Fine-tunes with each method from the same prior on the same real starts, and compares."""
     from sgft_jax.analysis.reading import read_runs
 
-    pretraining, runs = plan(args)
+    runs = plan(args)
     started = time.monotonic()
-    pretrain(pretraining)
     _finetune_all(*runs)
     summaries = {run.method: read_json(run_folder(run, args.real) / SUMMARY) for run in runs}
     results = figures(FiguresArgs(task=extend.name_of(args.task), out=args.out))
@@ -64,24 +61,21 @@ def main(args: DemoArgs) -> None:
     print(f"{(time.monotonic() - started) / 60:.1f} minutes in all")
 
 
-def plan(args: DemoArgs) -> tuple[PretrainArgs, list[FinetuneArgs]]:
+def plan(args: DemoArgs) -> list[FinetuneArgs]:
     """What runs; raises UserError for all that is wrong with it before any of it does."""
-    config = PRESETS["cpu"]
-    config = config if args.env_steps is None else replace(config, env_steps=args.env_steps)
-    shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
-    pretraining = PretrainArgs(config=config, report=False, video=False, **shared)
     check_task(args.task, [args.real])
     # Smaller batches and fewer updates than on a GPU: what two cores can do; all methods get the same. All else is the
     # methods' own: larger rates of the actor cost most of them success (docs/lessons.md).
-    size = {"seeds": args.seeds, "rollouts": args.rollouts, "eval_every": 5, "eval_episodes": 20, **shared}
+    shared = {"task": args.task, "prior": args.prior, "out": args.out, "overwrite": True, "real": (args.real,)}
+    size = {"seeds": args.seeds, "rollouts": args.rollouts, "eval_every": 5, "eval_episodes": 20}
     runs = []
     for method in METHODS:
         options, video = get_method(method).config(utd=4.0, batch_size=64), args.video and method == METHODS[0]
-        runs.append(arguments(method, real=(args.real,), options=options, video=video, **size))
-    check_pretraining(pretraining)
+        runs.append(arguments(method, options=options, video=video, **shared, **size))
     for run in runs:
         check(run)
-    return pretraining, runs
+        priors_of(run)
+    return runs
 
 
 def outcome(curves: "Sequence[Curve]", summaries: dict[str, dict[str, Any]]) -> str:

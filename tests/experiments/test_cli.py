@@ -384,17 +384,22 @@ def test_choose():
 
 
 def test_set_up_keeps_what_the_user_has_set():
-    os.environ.update(XLA_FLAGS="--xla_gpu_triton_gemm_any=false", JAX_COMPILATION_CACHE_DIR="/mine")
+    chosen = "--xla_gpu_triton_gemm_any=false --xla_backend_optimization_level=3"
+    os.environ.update(XLA_FLAGS=chosen, JAX_COMPILATION_CACHE_DIR="/mine")
     cli.set_up()
-    assert os.environ["XLA_FLAGS"] == "--xla_gpu_triton_gemm_any=false"
+    assert os.environ["XLA_FLAGS"] == chosen
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/mine"
 
 
-def test_set_up_adds_the_gpu_flag_once():
+@pytest.mark.parametrize("gpu", [False, True])
+def test_set_up_adds_each_flag_once(monkeypatch, gpu):
+    exists = Path.exists
+    monkeypatch.setattr(Path, "exists", lambda path: gpu if str(path) == "/dev/nvidiactl" else exists(path))
     os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
     cli.set_up()
     cli.set_up()
-    assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=2 --xla_gpu_triton_gemm_any=true"
+    flags = ["--xla_force_host_platform_device_count=2", "--xla_gpu_triton_gemm_any=true"]
+    assert os.environ["XLA_FLAGS"].split() == flags + ["--xla_backend_optimization_level=1"] * (not gpu)
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,10 @@
-"""The demo from pretraining to the table, on a point mass."""
+"""The demo from a prior to the table, on a point mass."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from priors_by_hand import save_prior
 from runs_by_hand import save
 
 import envs
@@ -47,8 +49,9 @@ def test_demo_compares_its_methods_from_one_prior(tmp_path, monkeypatch, capsys)
     monkeypatch.setitem(envs.TASKS, "toy", "toy")
     gap = tmp_path / "turned.toml"
     gap.write_text("[params]\nmass = 2.0\n[effects]\naction_rotation = 0.52\n")
-    out = tmp_path / "demo"
-    demo.main(demo.DemoArgs(task="toy", real=str(gap), env_steps=5_120, seeds=2, rollouts=3, video=False, out=out))
+    out, prior = tmp_path / "demo", tmp_path / "prior"
+    save_prior(prior, 0)
+    demo.main(demo.DemoArgs(task="toy", prior=prior, real=str(gap), seeds=2, rollouts=3, video=False, out=out))
     printed = capsys.readouterr().out
     table = [line for line in printed.splitlines() if line.startswith("|")]
     assert set(demo.METHODS) <= {line.split("|")[1].strip() for line in table}
@@ -66,11 +69,11 @@ def test_demo_compares_its_methods_from_one_prior(tmp_path, monkeypatch, capsys)
         ({"rollouts": 0}, "--rollouts is 0: must be at least 1"),
         ({"task": "insrt"}, "there is no 'insrt', did you mean 'insert'"),
         ({"real": "hrd"}, "gap of insert: there is no 'hrd', did you mean 'hard'"),
-        ({"env_steps": 0}, "option env-steps is 0: must be at least 1"),
+        ({"prior": Path("nowhere")}, "--prior nowhere: no such folder"),
     ],
 )
 def test_mistakes_are_found_before_anything_is_trained(tmp_path, monkeypatch, options, words):
-    monkeypatch.setattr(demo, "pretrain", lambda args: pytest.fail("trains"))
+    monkeypatch.setattr(demo, "finetune", lambda args: pytest.fail("trains"))
     with pytest.raises(UserError, match=words):
         demo.main(demo.DemoArgs(out=tmp_path, **options))
     assert not list(tmp_path.iterdir())
