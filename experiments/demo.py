@@ -118,6 +118,7 @@ def _finetune_all(first: FinetuneArgs, *others: FinetuneArgs) -> None:
 
 
 def _logged(runs: Sequence[FinetuneArgs], log: Path) -> None:
+    log.parent.mkdir(parents=True, exist_ok=True)
     with open(log, "w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
         for args in runs:
             finetune(args)
