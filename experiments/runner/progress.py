@@ -15,7 +15,6 @@ if TYPE_CHECKING:  # commands announce their start before they draw a bar
     from rich.progress import Progress
 
 _FIRST, _AGAIN, _SELDOM = 3.0, 10.0, 30.0  # s of silence: before the first words, then between two lines
-_SHOWN = ("description", "fields[words]")  # of the bar's task, on its sides
 _COMPILING = "/jax/core/compile/"  # how the names of the events begin that JAX reports of it
 
 
@@ -174,9 +173,8 @@ class RunProgress:
             from rich.progress import BarColumn, Progress, TextColumn
             from rich.table import Column
 
-            title, words = (TextColumn(f"{{task.{name}}}", table_column=Column()) for name in _SHOWN)  # they wrap
-            columns = (title, BarColumn(20), words)
-            self._live = Progress(*columns, console=self._console)
+            wrapped = [TextColumn(f"{{task.{x}}}", table_column=Column()) for x in ("description", "fields[words]")]
+            self._live = Progress(wrapped[0], BarColumn(20), wrapped[1], console=self._console)
             self._live.start()
             _VOICE.bar = self._live
             words = f"{self._counts()}, compiling"
