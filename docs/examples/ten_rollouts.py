@@ -10,6 +10,7 @@ chosen where enough of them fail; systems count alike. Falls: share of runs that
 from itertools import pairwise
 from math import comb
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -62,7 +63,7 @@ def probability(n: int, failures: int, success: np.ndarray) -> np.ndarray:
     return np.sum(terms, axis=0) * np.ones_like(success)
 
 
-def cells(values: list[float]) -> list[str]:
+def cells(values: list[Any]) -> list[str]:
     """Whole numbers."""
     return [f"{value:.0f}" for value in values]
 
