@@ -39,7 +39,7 @@ class RealDemoArgs:
 
     prior: Path = Path(f"shipped:{TASK}/seed-0")
     """Folder of a prior of panda-push."""
-    method: str = "guarded"
+    method: str = "sac"
     """How to fine-tune."""
     rollouts: int = 8
     """Real rollouts."""
