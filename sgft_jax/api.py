@@ -3,6 +3,7 @@
 The only module of this package that builds tasks; the others take an `Env` or less.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,14 +44,14 @@ class Setup(NamedTuple):
 
     With gaps M = gaps * seeds: the seeds of the first gap, then those of the next. With a `System` M = seeds.
     finetuner: the method. system: plays episodes. priors: params [P, ...], None without any. seeds: [M] uint32.
-    simulated: transitions of the simulator, None for a method that uses none.
+    simulated() -> transitions of the simulator, collected when they are first needed; None for a method that uses none.
     """
 
     finetuner: Finetuner
     system: System
     priors: PyTree
     seeds: Array
-    simulated: SimulatedRows | None
+    simulated: Callable[[], SimulatedRows] | None
 
 
 def setup(
@@ -90,7 +91,9 @@ def setup(
     stacked = stack([prior.params for prior in known]) if known else None
     members = jnp.tile(jnp.array(list(numbers), jnp.uint32), copies)
     needs = finetuner.simulation
-    simulated = None if needs is None else rows(needs, lambda: _collected(env, needs, known, stacked))
+    if needs is None:
+        return Setup(finetuner, system, stacked, members, None)
+    simulated = functools.cache(lambda: rows(needs, lambda: _collected(env, needs, known, stacked)))
     return Setup(finetuner, system, stacked, members, simulated)
 
 

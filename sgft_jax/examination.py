@@ -117,7 +117,8 @@ def _start(card: Mapping[str, Any], task: Task, params: Any, simulated: Rollouts
         which = order[jax.random.randint(key, (n,), 0, jnp.maximum(valid.sum(), 1))]
         return jax.tree.map(lambda x: x[which], rows)
 
-    return command_interface(network_of(card), task).start(params, SimulatedData(draw, jnp.zeros(1)))
+    interface = command_interface(network_of(card), task)
+    return interface.prepare(interface.start(params), SimulatedData(draw, jnp.zeros(1)))
 
 
 def _look(

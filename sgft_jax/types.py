@@ -238,7 +238,9 @@ class Learn(Protocol):
 class Finetuner(NamedTuple):
     """Fine-tuning of one agent on one real system, as pure functions; the caller vmaps over members.
 
-    init(params, key, simulated) -> state. params: of a prior, None without one. simulated: a `SimulatedData` or None.
+    init(params, key) -> state. params: of a prior, None without one.
+    prepare(state, simulated) -> state that has seen the simulated data once, for statistics; it acts as before. Comes
+        before `observe` and `learn`. simulated: a `SimulatedData`, or None for a method that asks for none.
     init_carry() -> carry of an episode.
     act, learn: see `Act` and `Learn`.
     observe(state, transitions [T, ...], valid [T], score []) -> state: keeps the rows of one episode, in order. score:
@@ -251,9 +253,11 @@ class Finetuner(NamedTuple):
     initial_policy: what makes them, from the prior's params; None = the agent itself.
     simulation: the simulated data that the method needs, or None.
     card: what the card of an exported policy says beyond the prior's, such as the options of a plan.
+    guarded: whether a guard chooses who acts: that is `policy` with what `export` returns.
     """
 
-    init: Callable[[PyTree, Key, SimulatedData | None], PyTree]
+    init: Callable[[PyTree, Key], PyTree]
+    prepare: Callable[[PyTree, SimulatedData | None], PyTree]
     init_carry: Callable[[], PyTree]
     act: Act
     observe: Callable[[PyTree, Transition, Array, Array | None], PyTree]
@@ -265,6 +269,7 @@ class Finetuner(NamedTuple):
     initial_policy: Policy | None
     simulation: Simulation | None
     card: Mapping[str, Any]
+    guarded: bool = False
 
 
 ValueLoss = Literal["iql", "sql", "eql", "xql"]

@@ -68,7 +68,7 @@ def main() -> None:
     obs, action = jax.random.uniform(jax.random.key(1), (2, 32, 1), minval=-1)
     next_obs = obs + 0.1 * action
     rows = sgft_jax.Transition(obs, action, -jnp.abs(next_obs[:, 0]), jnp.full(32, 0.9), next_obs)
-    state = tuner.observe(tuner.init(params, jax.random.key(2), None), rows, jnp.ones(32, bool), jnp.float32(0))
+    state = tuner.observe(tuner.init(params, jax.random.key(2)), rows, jnp.ones(32, bool), jnp.float32(0))
     state, metrics = jax.jit(tuner.learn, static_argnums=2)(state, jax.random.key(3), 20)
     print(f"mean shaped reward {metrics['batch/reward_mean']:.3f}, critic loss {metrics['critic/loss']:.3f}")
 

@@ -85,6 +85,7 @@ def through_system(task: str, impl: Impl, seeds: int, *, prior: Path, repeats: i
     env = envs.make(task, impl, **observed_by(folders))
     setup = api.setup(env, gaps.find(env.name, SIM), load_priors(folders, env), seeds=seeds)
     through = finetuning.finetune(*setup, rollouts=10**9)
+    next(through)  # the fresh state
     progress, _ = next(through)
     agent = jax.tree.map(lambda x: x.copy(), progress.agent)
     fused = jax.jit(_fused(setup), donate_argnums=0)

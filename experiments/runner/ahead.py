@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from typing import Any
 
 from envs.mujoco.processes import cores
@@ -16,21 +17,43 @@ class Ahead:
 
     def __init__(self, threads: ThreadPoolExecutor) -> None:
         self._threads = threads
-        self._begun: dict[Callable[..., Any], Future[Any]] = {}
+        self._begun: dict[Callable[..., Any], list[Future[Any]]] = {}
 
     def begin(self, function: Callable[[], Any]) -> None:
         """Begins to call a function in a thread."""
-        self._begun[function] = self._threads.submit(function)
+        self._submit(function, function)
 
     def compile(self, program: Any, *args: Any) -> None:
         """Begins to compile a jitted program for these arguments, or for their shapes (see `jax.eval_shape`)."""
-        self._begun[program] = self._threads.submit(program.lower(*args).compile)
+        self._submit(program, program.lower(*args).compile)
+
+    def promise(self, program: Any, args: Callable[[], tuple[Any, ...]]) -> None:
+        """The same with arguments that a thread works out: it traces the program, too."""
+        self._submit(program, lambda: program.lower(*args()).compile())
+
+    def awaited(self, program: Any, waiting: Callable[[], AbstractContextManager[None]]) -> Callable[..., Any]:
+        """The program, called when it has been compiled. waiting() says that it has not been yet."""
+
+        def call(*args: Any) -> Any:
+            with contextlib.nullcontext() if self.done(program) else waiting():
+                self.wait(program)
+            return program(*args)
+
+        return call
 
     def wait(self, *begun: Callable[..., Any]) -> None:
         """Until these are done, if they have begun. What fails fails again when it is called, which says it."""
         for function in begun:
-            if future := self._begun.pop(function, None):
-                future.exception()
+            for future in self._begun.pop(function, []):
+                if not future.cancelled():
+                    future.exception()
+
+    def done(self, function: Callable[..., Any]) -> bool:
+        """Whether waiting for this takes no time."""
+        return all(future.done() for future in self._begun.get(function, []))
+
+    def _submit(self, key: Callable[..., Any], work: Callable[[], Any]) -> None:
+        self._begun.setdefault(key, []).append(self._threads.submit(work))
 
 
 @contextlib.contextmanager

@@ -4,11 +4,12 @@ import contextlib
 import dataclasses
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import envs
@@ -16,8 +17,9 @@ from envs import mesh
 from envs.base import Env
 from envs.gaps import Gap
 from envs.rollout import Episode
-from envs.types import PyTree
+from envs.types import Key, PyTree
 from experiments.runner import cli, real_systems
+from experiments.runner.ahead import Ahead, compiling
 from experiments.runner.kept import kept_in, simulated_rows
 from experiments.runner.machines import reserve
 from experiments.runner.pictures import before_and_after
@@ -35,9 +37,9 @@ from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.real import RealStore
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, member, part
-from sgft_jax.systems.simulated import KnownSystem, System
-from sgft_jax.train import finetuning
-from sgft_jax.train.finetuning import FinetuneProgress
+from sgft_jax.systems.simulated import KnownSystem, Simulated, System
+from sgft_jax.train import finetuning, simulation
+from sgft_jax.train.finetuning import FinetuneProgress, Programs
 from sgft_jax.train.learner_process import LearnerProcess
 from sgft_jax.train.options import card_of
 from sgft_jax.types import Finetuner, Metrics, Online, Prior
@@ -243,26 +245,79 @@ class _Run(Training):
         self.args, self.setup, self.card, self.records, self.logs = args, setup, card, records, logs
         self.finetuner, self.system, self.seeds = setup.finetuner, setup.system, setup.seeds
         self.episodes = args.eval_episodes or 0
+        self.played: dict[int, Episode] = {}  # evaluations after so many rollouts, the first and the last one
         self.sync_every = args.sync_every if real_systems.is_robot(args.real[0]) else None
-        self.begin = functools.partial(finetuning.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
+        self.programs = finetuning.make_programs(setup.finetuner)
+        self.shapes = functools.cache(lambda: self.programs.begin.eval_shape(setup.priors, setup.seeds))
         title = f"{records[0].method} on {self.system.env.name}/{'+'.join(record.gap.name for record in records)}"
         every = {"eval_every": args.eval_every, "checkpoint_every": args.checkpoint_every}
         super().__init__(title, args.rollouts, len(records[0].seeds), **every)
 
     def work(self, learner: LearnerProcess | None) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries. learner: of a run with a robot."""
-        restored = self.restore(lambda: jax.eval_shape(lambda: _part(self.begin(), 0, self.count)))
+        restored = self.restore(lambda: jax.eval_shape(lambda state: _part(state, 0, self.count), self.shapes()))
         progress = _join([progress for progress, _ in restored]) if restored else None
         done, args = self.done(progress) if progress else 0, self.args
         stores = [record.real for record in self.records]
-        recorded = RecordedSystem(self.system, stores, done=done, sync_every=self.sync_every)
         logged = None
         if self.logs:
             sizes = {"capacity": args.options.replay_capacity, "updates": args.real_updates}
             logged = begin_with(self.logs, self.finetuner, self.system.env, **sizes)
-        setup, how = self.setup._replace(system=recorded), {"waits": args.hand_over == "rollouts", "logged": logged}
-        steps = finetuning.finetune(*setup, rollouts=args.rollouts, learner=learner, progress=progress, **how)
-        return self._finish(self.follow(steps, done))
+        how: dict[str, Any] = {"waits": args.hand_over == "rollouts", "logged": logged}
+        with compiling() as ahead:
+            system = self.system
+            if isinstance(system, Simulated) and mesh.pieces() == 1:  # threads would know nothing of a mesh
+                how["programs"] = self._compile(ahead, system, begins=progress is None)
+                self.system = _Awaited(system, ahead)
+            recorded = RecordedSystem(self.system, stores, done=done, sync_every=self.sync_every)
+            setup = self.setup._replace(system=recorded)
+            steps = finetuning.finetune(*setup, rollouts=args.rollouts, learner=learner, progress=progress, **how)
+            last = self.follow(steps, done)
+        return self._finish(last)
+
+    def _compile(self, ahead: Ahead, system: Simulated, *, begins: bool) -> Programs:
+        """Begins to compile what a run calls until it has learned once, in that order; returns what waits for it."""
+        fine, programs, (_, _, priors, seeds, _) = self.finetuner, self.programs, self.setup
+        who, which, needs = fine.initial_policy or fine, finetuning.prior_of(priors, seeds), fine.simulation
+
+        agent, best = self.shapes().agent, self.shapes().best
+
+        def keys(*shape: int) -> Any:
+            return jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (len(seeds), *shape)))
+
+        def evaluated() -> tuple[Any, ...]:
+            states = jax.eval_shape(jax.vmap(fine.export), agent) if fine.guarded else agent
+            return states, system.pools, system.which, keys(self.episodes), False
+
+        def playing() -> tuple[Any, ...]:
+            states = agent if fine.initial_policy is None else finetuning.priors_of_members(priors, seeds)
+            return states, system.pools, system.which, keys(1), True
+
+        @functools.cache
+        def played() -> Episode:
+            return system.program(who).eval_shape(*playing())
+
+        def judged() -> tuple[Any, ...]:
+            outcome = jax.eval_shape(lambda x: tuple(y[:, 0] for y in (x.score, x.total_reward, x.exploded)), played())
+            return best, agent, *outcome, jnp.int32(0)
+
+        rows = None if needs is None else simulation.shapes(system.env, needs, len(jax.tree.leaves(priors)[0]))
+        if begins:
+            ahead.promise(programs.begin, lambda: (priors, seeds))
+        if self.episodes:
+            ahead.promise(system.program(fine.policy if fine.guarded else fine), evaluated)
+        ahead.promise(system.program(who), playing)
+        if fine.initial_policy is None:
+            ahead.promise(programs.judge, judged)
+        ahead.promise(programs.store, lambda: (agent, played().transitions, played().valid, played().score))
+        updates = fine.updates_per_rollout
+        ahead.promise(programs.learn, lambda: (agent, keys(), which, updates, rows, False, None))
+        if begins and needs is not None:
+            ahead.promise(programs.prepare, lambda: (agent, which, rows))
+        compiles = functools.partial(doing, "compiling what learns", 40, once=True)
+        waits = Programs(*[ahead.awaited(program, compiles) for program in programs])
+        soon = {x: ahead.awaited(getattr(programs, x), contextlib.nullcontext) for x in ("begin", "judge")}
+        return waits._replace(learn=_learning(waits.learn), **soon)
 
     def done(self, state: FinetuneProgress) -> int:
         return int(state.rollouts)
@@ -272,6 +327,8 @@ class _Run(Training):
             return doing("preparing the agents", 10, once=True)
         if int(before.offline) < finetuning.simulated_updates_of(self.finetuner):
             return doing("learning from simulated transitions")
+        if not self.done(before) and isinstance(self.system, _Awaited):
+            return doing("playing the first rollout", 10, once=True)
         if not self.done(before):
             return doing("playing the first rollout and compiling what learns from it", 60, once=True)
         return doing("playing and learning")
@@ -296,6 +353,7 @@ class _Run(Training):
             stores = [evaluation_store(record.folder, done) for record in self.records]
             system = RecordedSystem(system, stores, done=0, explore=False, sync_every=self.sync_every)
         played = finetuning.evaluate(self.finetuner, system, state.agent, self.seeds, self.episodes)
+        self.played = {n: x for n, x in [*self.played.items(), (done, played)] if n in (0, done)}
         values = scores(played, state.best.worst)
         for record, (score, cost) in self.each((values, np.asarray(played.valid.sum((1, 2))))):
             record.evaluation(done, score, cost)
@@ -314,7 +372,7 @@ class _Run(Training):
         """Policies, summaries, figures and films."""
         best = progress.best
         card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
-        last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
+        last = finetuning.exported(self.finetuner.export, progress.agent)
         facts = {"evidence": best.score, "rollouts": best.age}
         n = self.episodes
         if n and self.system.pools is not None:
@@ -341,13 +399,35 @@ class _Run(Training):
     def _before_and_after(self, progress: FinetuneProgress) -> list[Episode]:
         """The evaluation episodes [M, n] of the policy before the first real rollout and of the agent as it is now."""
         evaluate = functools.partial(finetuning.evaluate, system=self.system, seeds=self.seeds)
-        n, initial = self.episodes, self.finetuner.initial_policy
-        if initial is None:
-            before = evaluate(self.finetuner, states=jax.jit(self.begin)().agent, episodes=n)
-        else:
+        n, initial, done = self.episodes, self.finetuner.initial_policy, self.done(progress)
+        after = self.played.get(done) or evaluate(self.finetuner, states=progress.agent, episodes=n)
+        if initial is not None:
             priors = finetuning.priors_of_members(self.setup.priors, self.seeds)
-            before = evaluate(initial, states=priors, episodes=n)
-        return [before, evaluate(self.finetuner, states=progress.agent, episodes=n)]
+            return [evaluate(initial, states=priors, episodes=n), after]
+        fresh = functools.partial(self.programs.begin, self.setup.priors, self.seeds)
+        return [self.played.get(0) or evaluate(self.finetuner, states=fresh().agent, episodes=n), after]
+
+
+class _Awaited:
+    """Simulated systems whose programs may still compile in threads: whoever plays waits for them."""
+
+    def __init__(self, inner: Simulated, ahead: Ahead) -> None:
+        self.inner, self.ahead, self.env, self.pools = inner, ahead, inner.env, inner.pools
+
+    def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
+        """See `System`."""
+        self.ahead.wait(self.inner.program(policy))
+        return self.inner.play(policy, states, keys, explore=explore)
+
+
+def _learning(learn: Callable[..., Any]) -> Callable[..., Any]:
+    """The same, which says so and is done when it returns."""
+
+    def call(*args: Any) -> Any:
+        with doing("learning"):
+            return jax.block_until_ready(learn(*args))
+
+    return call
 
 
 _OF_MEMBERS = ("agent", "best", "transitions")  # of a state, what has an axis of members

@@ -228,7 +228,7 @@ def _identified(part: Interface, priors: int, members: PyTree, explored: Episode
             indices = jax.random.randint(key, (n,), 0, flat.reward.shape[0])
             return jax.tree.map(lambda x: x[indices], flat)
 
-        return part.start(params, SimulatedData(draw, jnp.zeros(1)))
+        return part.prepare(part.start(params), SimulatedData(draw, jnp.zeros(1)))
 
     sim = jax.vmap(start)(*jax.tree.map(lambda x: x[:priors], (members, rows)))
     everywhere = jax.tree.map(lambda x: jnp.tile(x, (len(held) // priors, *[1] * (x.ndim - 1))), sim)

@@ -72,15 +72,19 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     structure = iql.IQLConfig(task.obs_dim, task.act_dim, network, config.max_grad_norm)
     learner = iql.make_iql(structure, replace(config, reward_scale=config.reward_scale or 1.0))
 
-    def start(params: SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
+    def start(params: SACParams | None, key: Key) -> tuple[PyTree, PyTree]:
         state = learner.init(key)
-        if config.reward_scale is None and simulated is not None:  # published: returns span the length of an episode
-            span = jnp.max(simulated.returns) - jnp.min(simulated.returns)
-            scale = jnp.float32(task.episode_length / jnp.maximum(span, 1e-6))
-            state = state.replace(hyper=state.hyper._replace(reward_scale=scale))
         if params is None:
             return state, SACParams(None, None, None, None, state.normalizer)
         return state.replace(normalizer=params.normalizer), params._replace(actor=None, critic=None)
+
+    def prepare(state: FinetuneState, simulated: SimulatedData) -> FinetuneState:
+        if config.reward_scale is not None:
+            return state
+        span = jnp.max(simulated.returns) - jnp.min(simulated.returns)  # published: that of the length of an episode
+        scale = jnp.float32(task.episode_length / jnp.maximum(span, 1e-6))
+        hyper = state.learner.hyper._replace(reward_scale=scale)
+        return state._replace(learner=state.learner.replace(hyper=hyper))
 
     def export(state: FinetuneState) -> SACParams:
         actor = iql.as_tanh_gaussian(state.learner.actor.params)
@@ -91,6 +95,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     parts = Parts(
         learner=learner,
         start=start,
+        prepare=prepare,
         export=export,
         policy=sac_policy(task.obs_dim, task.act_dim, network),
         source=lambda state: source,

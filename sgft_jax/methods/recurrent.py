@@ -25,7 +25,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.train.options import card_of
 
     policy = make_policy(card_of(prior), task)
-    parts = unlearned(policy, start=lambda params, key, simulated: ((), params), export=lambda state: state.frozen)
+    parts = unlearned(policy, start=lambda params, key: ((), params), export=lambda state: state.frozen)
     return assemble(parts, LoopOptions(initial_rollouts=config.initial_rollouts), task)._replace(updates_per_rollout=1)
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 from envs.types import Key, PyTree
 from sgft_jax import checks
 from sgft_jax.train.options import DynamicsOptions
-from sgft_jax.types import Finetuner, Method, Online, Prior, SimulatedData, Task
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     plan = {"horizon": config.horizon, "samples": config.plan_samples, "noise": config.plan_noise}
     structure = MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
 
-    def start(params: SACParams, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
-        del key, simulated
+    def start(params: SACParams, key: Key) -> tuple[PyTree, PyTree]:
+        del key
         return (), params._replace(dynamics=None)
 
     def export(state: FinetuneState) -> SACParams:

@@ -67,15 +67,17 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
         after = dynamics.predict(model, params.dynamics, params.normalizer, obs, action).mean(axis=0)
         return (after - obs)[: task.measured_dim]
 
-    def start(params: SACParams, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
+    def start(params: SACParams, key: Key) -> tuple[PyTree, PyTree]:
         del key
-        if simulated is None:
-            raise UserError("sysid needs simulated transitions, which tell how far the models are off")
+        return (jnp.zeros(task.measured_dim), system.unknown(len(varying))), params
+
+    def prepare(state: FinetuneState, simulated: SimulatedData) -> FinetuneState:
+        """Measures how far the models are off."""
         rows = simulated.draw(jax.random.key(0), _SIMULATED)
         after = (rows.next_obs - rows.obs)[:, : task.measured_dim]
-        missed = after - jax.vmap(lambda row: change(params, row.obs, row.action))(rows)
+        missed = after - jax.vmap(lambda row: change(state.frozen, row.obs, row.action))(rows)
         spread = spread_of(missed, after, jnp.ones(_SIMULATED, bool))
-        return (spread, system.unknown(len(varying))), params
+        return state._replace(learner=(spread, state.learner[1]))
 
     def observed(state: FinetuneState) -> FinetuneState:
         if not varying:
@@ -100,7 +102,10 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     parts = unlearned(sac_policy(task.obs_dim, task.act_dim, network), start, export)
     parts = parts._replace(
-        learner=parts.learner._replace(update=report), observed=observed, simulation=Simulation(20_000, 0.6)
+        learner=parts.learner._replace(update=report),
+        prepare=prepare,
+        observed=observed,
+        simulation=Simulation(20_000, 0.6),
     )
     # One update after a rollout says what was fitted; more would say it again.
     return assemble(parts, loop, task)._replace(updates_per_rollout=1)

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
 from sgft_jax.train.options import LoopOptions
-from sgft_jax.types import Batch, Finetuner, Method, Online, Prior, SimulatedData, Task, Transform
+from sgft_jax.types import Batch, Finetuner, Method, Online, Prior, Task, Transform
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,7 @@ def build(config: PlannerOptions, prior: Prior | None, task: Task) -> Finetuner:
     )
     learner = tdmpc2.make_tdmpc2(structure, hyper)
 
-    def start(params: TDMPC2Params | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
-        del simulated
+    def start(params: TDMPC2Params | None, key: Key) -> tuple[PyTree, PyTree]:
         if params is None:
             return learner.init(key), None
         if fresh:

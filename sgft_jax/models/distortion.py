@@ -165,12 +165,13 @@ class Identified(NamedTuple):
 class Interface(NamedTuple):
     """Identification as pure functions.
 
-    start(params of a prior, simulated) -> Identified, from simulated rows alone.
+    start(params of a prior) -> Identified, before any row. prepare(identified, simulated) -> the same with the spread.
     refit(identified, rows [n], held [n] bool) -> Identified, fitted to the rows that `held` marks.
     meant(identified, batch) -> the batch, its real rows translated into the simulator's actions and measurements.
     """
 
-    start: Callable[[PyTree, SimulatedData], Identified]
+    start: Callable[[PyTree], Identified]
+    prepare: Callable[[Identified, SimulatedData], Identified]
     refit: Callable[[Identified, Transition, Array], Identified]
     meant: Callable[[Identified, Batch], Batch]
 
@@ -178,12 +179,15 @@ class Interface(NamedTuple):
 def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Interface:
     """Identification for a task. model(params, obs, action) -> [measured_dim]; kept(prior's params) -> its params."""
 
-    def start(params: PyTree, simulated: SimulatedData) -> Identified:
-        simulator, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
-        nothing, held = none(task.act_dim, task.measured_dim), jnp.ones(_SIMULATED, bool)
-        missed = residuals(lambda *x: model(simulator, *x), rows, nothing)
+    def start(params: PyTree) -> Identified:
+        unknown = jnp.zeros(task.measured_dim)
+        return Identified(jax.tree.map(jnp.copy, kept(params)), unknown, none(task.act_dim, task.measured_dim))
+
+    def prepare(known: Identified, simulated: SimulatedData) -> Identified:
+        rows, held = simulated.draw(jax.random.key(0), _SIMULATED), jnp.ones(_SIMULATED, bool)
+        missed = residuals(lambda *x: model(known.params, *x), rows, none(task.act_dim, task.measured_dim))
         change = (rows.next_obs - rows.obs)[:, : missed.shape[1]]
-        return Identified(simulator, spread_of(missed, change, held), nothing)
+        return known._replace(spread=spread_of(missed, change, held))
 
     def refit(known: Identified, rows: Transition, held: Array) -> Identified:
         rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))
@@ -200,7 +204,7 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
             return new
         return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, new)
 
-    return Interface(start, refit, meant)
+    return Interface(start, prepare, refit, meant)
 
 
 def command_interface(network: NetworkConfig, task: Task) -> Interface:

@@ -75,7 +75,7 @@ class Parts(NamedTuple):
     """What a method chooses.
 
     learner: its `update` takes the transformed batch.
-    start(params, key, simulated) -> (learner's state, frozen part of the prior).
+    start(params, key) -> (learner's state, frozen part of the prior). prepare: see `Finetuner`, with simulated data.
     export(state) -> params; policy: how they act.
     act: as in `Finetuner`, of a `FinetuneState`; None = the learner's.
     source(state) -> where a batch comes from, None = rows of the replay; offline: the same before the first real
@@ -91,9 +91,10 @@ class Parts(NamedTuple):
     """
 
     learner: Learner
-    start: Callable[[PyTree, Key, SimulatedData | None], tuple[PyTree, PyTree]]
+    start: Callable[[PyTree, Key], tuple[PyTree, PyTree]]
     export: Callable[[FinetuneState], PyTree]
     policy: Policy
+    prepare: Callable[[FinetuneState, SimulatedData], FinetuneState] = lambda state, simulated: state
     act: Callable[..., tuple[Array, PyTree]] | None = None
     source: Callable[[FinetuneState], Source] | None = None
     offline: Source | None = None
@@ -116,17 +117,22 @@ def assemble(parts: Parts, options: LoopOptions, task: Task) -> Finetuner:
             return parts.offline
         return parts.source(state) if parts.source else sources.real_rows(options.batch_size)
 
-    def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> FinetuneState:
+    def init(params: PyTree, key: Key) -> FinetuneState:
         key_learner, key_transform = jax.random.split(key)
-        learner, frozen = parts.start(params, key_learner, simulated)
+        learner, frozen = parts.start(params, key_learner)
         models = None if parts.models is None else parts.models.start(params)
         empty = parts.memory.init(replay.blank(task.obs_dim, task.act_dim), options.replay_capacity)
-        interface = None
-        if parts.interface is not None and simulated is not None:
-            interface = parts.interface.start(params, simulated)
+        interface = None if parts.interface is None else parts.interface.start(params)
         state = FinetuneState(learner, models, frozen, parts.transform.init(params, key_transform), empty, interface)
         # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
         return jax.tree.map(jnp.copy, state)
+
+    def prepare(state: FinetuneState, simulated: SimulatedData | None) -> FinetuneState:
+        if simulated is None:
+            return state
+        if parts.interface is not None and state.interface is not None:
+            state = state._replace(interface=parts.interface.prepare(state.interface, simulated))
+        return parts.prepare(state, simulated)
 
     def observe(state: FinetuneState, rows: Transition, valid: Array, score: Array | None) -> FinetuneState:
         del score  # rewards are what is learned from
@@ -172,6 +178,7 @@ def assemble(parts: Parts, options: LoopOptions, task: Task) -> Finetuner:
 
     finetuner = Finetuner(
         init=init,
+        prepare=prepare,
         init_carry=parts.policy.init_carry,
         act=act,
         observe=observe,
@@ -246,7 +253,7 @@ def _changing(state: FinetuneState) -> dict[str, PyTree]:
 
 def unlearned(
     policy: Policy,
-    start: Callable[[PyTree, Key, SimulatedData | None], tuple[PyTree, PyTree]],
+    start: Callable[[PyTree, Key], tuple[PyTree, PyTree]],
     export: Callable[[FinetuneState], PyTree],
 ) -> Parts:
     """Parts of a method whose policy never learns: it acts as what is exported, whatever else adapts."""
@@ -257,7 +264,7 @@ def unlearned(
         return policy.act(export(state), carry, obs, key, explore=explore)
 
     nothing = Learner(lambda key: (), policy.init_carry, act, lambda state, batch, key: (state, {}))
-    return Parts(nothing, start, export, policy, act)
+    return Parts(nothing, start, export, policy, act=act)
 
 
 # --- SAC --------------------------------------------------------------------------------------------------------------
@@ -306,8 +313,7 @@ def sac_finetuner(
     models = dynamics_models(options, network, task) if options.train_dynamics else None
     whole = steps_to_go(jnp.int32(horizon_dim), horizon_dim) if config.context_dim else None
 
-    def start(params: sac.SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
-        del simulated
+    def start(params: sac.SACParams | None, key: Key) -> tuple[PyTree, PyTree]:
         if params is None:
             state = learner.init(key)
             return state, sac.SACParams(None, None, None, None, state.normalizer)

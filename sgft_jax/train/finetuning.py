@@ -18,7 +18,6 @@ from sgft_jax.keys import Finetuning
 from sgft_jax.systems.simulated import System
 from sgft_jax.train import evidence
 from sgft_jax.train.evidence import Best
-from sgft_jax.train.guard import Guarded
 from sgft_jax.train.simulation import SimulatedRows
 from sgft_jax.types import Finetuner, Metrics
 
@@ -65,24 +64,26 @@ def finetune(
     system: System,
     priors: PyTree,
     seeds: Array,
-    simulated: SimulatedRows | None = None,
+    simulated: Callable[[], SimulatedRows] | None = None,
     *,
     rollouts: int,
     progress: FinetuneProgress | None = None,
     learner: "LearnerProcess | None" = None,
     waits: bool = True,
     logged: Logged | None = None,
+    programs: "Programs | None" = None,
 ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
     """Fine-tunes M members, each a seed on a real system, until each has made `rollouts` real rollouts.
 
     priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P.
-    seeds: [M] uint32. simulated: see `simulate`, for methods that ask for it.
+    seeds: [M] uint32. simulated() -> what `simulate` returns, for methods that ask for it; called when something first
+    learns from it, which is after the first rollout where nothing is learned before.
     progress: where an earlier run stopped, or None. logged: logs to begin with: all members keep their episodes and
     make `logged.updates` updates, as they learn from real rollouts, before they play.
     learner: a process that learns while the system is reset, for systems that are stepped (`Gymnasium.play`); None:
     this process learns between rollouts. waits: True holds the first step of a rollout until learning has finished, so
     results are those without a `learner`. False plays with the old policy until the new one has been learned; such a
-    rollout is evidence for the one that made more of its steps.
+    rollout is evidence for the one that made more of its steps. programs: compiled already; None makes them.
 
     A rollout of full length is followed by `finetuner.updates_per_rollout` updates, a shorter one by its share, one at
     least, and one without a valid step by none.
@@ -92,7 +93,7 @@ def finetune(
     are arrays [M]. Every random draw follows from (seed, purpose, rollout), so a resumed run draws what an
     uninterrupted one would have drawn, and all methods meet the same real starts.
     """
-    step = _Steps(finetuner, system, priors, seeds, simulated)
+    step = _Steps(finetuner, system, priors, seeds, simulated, programs)
     if progress is None:
         progress = step.begin()
         yield progress, {}
@@ -103,7 +104,7 @@ def finetune(
             progress = step.keep(progress, logged)
         progress = yield from step.offline(progress, simulated_updates + logged.updates, learner, "logged")
     if learner is not None:
-        if not waits and isinstance(progress.agent, Guarded):
+        if not waits and finetuner.guarded:
             raise UserError("waits=False: a guard judges rollouts by one policy; leave one of the two out")
         yield from step.beside(progress, learner, rollouts, waits=waits)
         return
@@ -128,40 +129,84 @@ def evaluate(policy: Any, system: System, states: PyTree, seeds: Array, episodes
 
     policy, states: see `System.play`; for a `Finetuner` the states are `FinetuneProgress.agent`.
     """
-    if isinstance(states, Guarded):  # acts as what it exports: one program plays that and the best policies
-        policy, states = policy.policy, _exported(policy.export, states)
+    if isinstance(policy, Finetuner) and policy.guarded:  # one program plays agents and the best policies
+        policy, states = policy.policy, exported(policy.export, states)
     return system.play(policy, states, _episode_keys(seeds, Finetuning.EVALUATE, 0, episodes), explore=False)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _exported(export: Callable[[PyTree], PyTree], states: PyTree) -> PyTree:
+def exported(export: Callable[[PyTree], PyTree], states: PyTree) -> PyTree:
+    """Params [M, ...] of the agents [M, ...] as they act now."""
     return jax.vmap(export)(states)
 
 
-def begin(
-    finetuner: Finetuner, priors: PyTree, seeds: Array, simulated: SimulatedRows | None = None
-) -> FinetuneProgress:
+def begin(finetuner: Finetuner, priors: PyTree, seeds: Array) -> FinetuneProgress:
     """The state that `finetune` starts from. `jax.eval_shape` of it says what a checkpoint is read into."""
-    which = prior_of(priors, seeds)
 
-    def one(params: PyTree, seed: Array, which: Array, rows: SimulatedRows | None) -> PyTree:
-        return finetuner.init(params, _key(seed, Finetuning.INIT, 0), None if rows is None else rows.of(which))
+    def one(params: PyTree, seed: Array) -> PyTree:
+        return finetuner.init(params, _key(seed, Finetuning.INIT, 0))
 
-    agent = split_vmap(one, (0, 0, 0, None))(priors_of_members(priors, seeds), seeds, which, simulated)
+    agent = split_vmap(one)(priors_of_members(priors, seeds), seeds)
     m = seeds.shape[0]
     best = evidence.nothing_known(jax.tree.map(jnp.copy, jax.vmap(finetuner.export)(agent)), m)
     return FinetuneProgress(agent, best, jnp.int32(0), jnp.int32(0), jnp.zeros(m, jnp.int32))
 
 
+class Programs(NamedTuple):
+    """What `finetune` calls, jitted, of members [M]; those that take a state use it up.
+
+    begin(priors, seeds) -> `FinetuneProgress`. prepare(agent, which, rows) -> agent; which: [M] the prior of each.
+    judge, witness: `evidence.judged` and `witnessed`. store(agent, transitions [M, 1, T], valid, score) -> agent.
+    keep(agent, transitions [T], valid, None) -> agent. learn(agent, keys, which, updates, rows, offline, limits) ->
+    (agent, metrics).
+    """
+
+    begin: Callable[..., FinetuneProgress]
+    prepare: Callable[..., PyTree]
+    judge: Callable[..., Best]
+    witness: Callable[..., Best]
+    store: Callable[..., PyTree]
+    keep: Callable[..., PyTree]
+    learn: Callable[..., tuple[PyTree, Metrics]]
+
+
+def make_programs(finetuner: Finetuner) -> Programs:
+    """The programs of a method; each compiles when it is first called, if it has not been compiled before."""
+
+    def prepare(state: PyTree, which: Array, rows: SimulatedRows | None) -> PyTree:
+        return finetuner.prepare(state, None if rows is None else rows.of(which))
+
+    def store(state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
+        return finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0], score[0])
+
+    return Programs(
+        begin=jax.jit(functools.partial(begin, finetuner)),
+        prepare=jax.jit(split_vmap(prepare, (0, 0, None)), donate_argnums=0),
+        judge=jax.jit(functools.partial(evidence.judged, finetuner)),
+        witness=jax.jit(evidence.witnessed),
+        store=jax.jit(split_vmap(store), donate_argnums=0),
+        keep=jax.jit(split_vmap(finetuner.observe, (0, None, None, None)), donate_argnums=0),
+        learn=jax.jit(functools.partial(_update, finetuner), static_argnums=(3, 5), donate_argnums=0),
+    )
+
+
 class Updates:
     """Learning phases of M members, compiled.
 
-    seeds: [M] uint32. which: [M] the prior of each. simulated: see `finetune`.
+    seeds: [M] uint32. which: [M] the prior of each. simulated: see `finetune`. learn: of `Programs`.
     """
 
-    def __init__(self, finetuner: Finetuner, seeds: Array, which: Array, simulated: SimulatedRows | None) -> None:
-        self.finetuner, self.seeds, self.which, self.simulated = finetuner, seeds, which, simulated
-        self._learn = jax.jit(self._update, static_argnums=(2, 4), donate_argnums=0)
+    def __init__(
+        self,
+        finetuner: Finetuner,
+        seeds: Array,
+        which: Array,
+        simulated: Callable[[], SimulatedRows] | None,
+        learn: Callable[..., tuple[PyTree, Metrics]] | None = None,
+    ) -> None:
+        self.finetuner, self.seeds, self.which = finetuner, seeds, which
+        self.rows = simulated or (lambda: None)
+        self._learn = learn or make_programs(finetuner).learn
 
     def __call__(
         self, agent: PyTree, parts: Sequence[int], updates: int | Array, phase: Phase = "online"
@@ -171,54 +216,70 @@ class Updates:
         updates: or [parts, M], of each part and member, up to `updates_per_rollout`. phase: "offline", on simulated
         transitions alone; "logged", before the first rollout; "online", after one.
         """
-        purpose, learned = Finetuning.LEARN if phase == "online" else Finetuning.OFFLINE, []
+        purpose, learned, rows = Finetuning.LEARN if phase == "online" else Finetuning.OFFLINE, [], self.rows()
         most, limits = (updates, None) if isinstance(updates, int) else (self.finetuner.updates_per_rollout, updates)
         for i, part in enumerate(parts):  # equal parts, so that one compiled program serves any number
-            keys = jax.vmap(lambda seed, part=part: _key(seed, purpose, part))(self.seeds)
+            keys = _learning_keys(self.seeds, purpose, part)
             limit = None if limits is None else limits[i]
-            agent, metrics = self._learn(agent, keys, most, self.simulated, phase == "offline", limit)
+            agent, metrics = self._learn(agent, keys, self.which, most, rows, phase == "offline", limit)
             learned.append(metrics)
         return agent, jax.tree.map(_mean, *learned) if limits is None else _mean_of_parts(learned)
 
-    def _update(
-        self, states: PyTree, keys: Key, updates: int, source: SimulatedRows | None, offline: bool, limits: Array | None
-    ) -> tuple[PyTree, Metrics]:
-        def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None, limit: Array | None) -> Any:
-            data = None if rows is None else rows.of(which)
-            # Where no episode ends early the number is static: the program, and its bits, of a fixed length.
-            some = {} if limit is None else {"limit": limit}
-            return self.finetuner.learn(state, key, updates, data, offline=offline, **some)
 
-        axes = (0, 0, 0, None, None if limits is None else 0)
-        return split_vmap(one, axes)(states, keys, self.which, source, limits)
+def _update(
+    finetuner: Finetuner,
+    states: PyTree,
+    keys: Key,
+    which: Array,
+    updates: int,
+    source: SimulatedRows | None,
+    offline: bool,
+    limits: Array | None,
+) -> tuple[PyTree, Metrics]:
+    def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None, limit: Array | None) -> Any:
+        data = None if rows is None else rows.of(which)
+        # Where no episode ends early the number is static: the program, and its bits, of a fixed length.
+        some = {} if limit is None else {"limit": limit}
+        return finetuner.learn(state, key, updates, data, offline=offline, **some)
+
+    axes = (0, 0, 0, None, None if limits is None else 0)
+    return split_vmap(one, axes)(states, keys, which, source, limits)
 
 
 class _Steps:
-    """The compiled steps of one run."""
+    """The steps of one run."""
 
     def __init__(
-        self, finetuner: Finetuner, system: System, priors: PyTree, seeds: Array, simulated: SimulatedRows | None
+        self,
+        finetuner: Finetuner,
+        system: System,
+        priors: PyTree,
+        seeds: Array,
+        simulated: Callable[[], SimulatedRows] | None,
+        programs: Programs | None,
     ) -> None:
-        self.finetuner, self.system, self.simulated = finetuner, system, simulated
-        self.priors, self.seeds = priors, seeds
+        self.finetuner, self.system, self.priors, self.seeds = finetuner, system, priors, seeds
+        self.programs = programs or make_programs(finetuner)
         if finetuner.simulation is not None and simulated is None:
             raise UserError("this method also learns from simulated transitions: pass `simulated` (see `simulate`)")
-        self._learn = Updates(finetuner, seeds, prior_of(priors, seeds), simulated)
-        self._store = jax.jit(split_vmap(self._observe), donate_argnums=0)
-        self._keep_log = jax.jit(split_vmap(finetuner.observe, (0, None, None, None)), donate_argnums=0)
-        self._witness = jax.jit(evidence.witnessed)
-        self._judge = jax.jit(functools.partial(evidence.judged, finetuner))
+        self._learn = Updates(finetuner, seeds, prior_of(priors, seeds), simulated, self.programs.learn)
 
     def begin(self) -> FinetuneProgress:
-        """The fresh state."""
-        return jax.jit(functools.partial(begin, self.finetuner))(self.priors, self.seeds, self.simulated)
+        """The fresh state, which has seen no simulated row."""
+        return self.programs.begin(self.priors, self.seeds)
+
+    def prepare(self, agent: PyTree) -> PyTree:
+        """The agent before it observes or learns anything. From here on there are simulated rows."""
+        if self.finetuner.simulation is None:
+            return agent
+        return self.programs.prepare(agent, self._learn.which, self._learn.rows())
 
     def keep(self, progress: FinetuneProgress, logged: Logged) -> FinetuneProgress:
         """The episodes of a log, one after another, as if they had been played."""
-        agent = progress.agent
+        agent = progress.agent if int(progress.offline) else self.prepare(progress.agent)
         for i in range(len(logged.valid)):
             rows = jax.tree.map(lambda x, i=i: x[i], logged.transitions)
-            agent = self._keep_log(agent, rows, logged.valid[i], None)
+            agent = self.programs.keep(agent, rows, logged.valid[i], None)
         return progress._replace(agent=agent)
 
     def offline(
@@ -227,6 +288,8 @@ class _Steps:
         """Updates before the first rollout, part by part, until there are so many of them."""
         while (done := int(progress.offline)) < until:
             updates = min(OFFLINE_PART, until - done)
+            if not done:
+                progress = progress._replace(agent=self.prepare(progress.agent))
             if learner is None:
                 agent, metrics = self._learn(progress.agent, [done], updates, phase)
             else:
@@ -293,17 +356,15 @@ class _Steps:
         for episodes in played:
             score, total, exploded = (x[:, 0] for x in (episodes.score, episodes.total_reward, episodes.exploded))
             if done or self.finetuner.initial_policy is None:
-                best = self._judge(best, player[0], score, total, exploded, jnp.int32(player[1]))
+                best = self.programs.judge(best, player[0], score, total, exploded, jnp.int32(player[1]))
             else:
-                best = self._witness(best, score, total)
+                best = self.programs.witness(best, score, total)
+        if not done:
+            agent = self.prepare(agent)
         for episodes in played:
             score = jnp.where(episodes.exploded, -jnp.inf, episodes.score)
-            agent = self._store(agent, episodes.transitions, episodes.valid, score)
+            agent = self.programs.store(agent, episodes.transitions, episodes.valid, score)
         return agent, best
-
-    def _observe(self, state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
-        """transitions, valid: [1, T, ...]. score: [1]."""
-        return self.finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0], score[0])
 
 
 class _Acting:
@@ -372,6 +433,11 @@ def prior_of(priors: PyTree, seeds: Array) -> Array:
 
 def _key(seed: Array, purpose: int | Array, part: int | Array) -> Key:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), purpose), part)
+
+
+@jax.jit
+def _learning_keys(seeds: Array, purpose: Array, part: Array) -> Key:
+    return jax.vmap(lambda seed: _key(seed, purpose, part))(seeds)
 
 
 @functools.partial(jax.jit, static_argnums=3)

@@ -172,10 +172,13 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
     """
     kind = score
 
-    def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> Guarded:
-        agent = inner.init(params, key, simulated)
+    def init(params: PyTree, key: Key) -> Guarded:
+        agent = inner.init(params, key)
         # A copy: the caller may donate the state, and the prior must survive that.
         return Guarded(agent, jax.tree.map(jnp.copy, first(params, inner.export(agent))), start(kind))
+
+    def prepare(state: Guarded, simulated: SimulatedData | None) -> Guarded:
+        return state._replace(agent=inner.prepare(state.agent, simulated))
 
     def export(state: Guarded) -> PyTree:
         return optax.tree.where(state.guard.deployed, inner.export(state.agent), state.reference)
@@ -212,6 +215,5 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
         metrics |= expected | {name: x.astype(jnp.float32) for name, x in flags.items()}
         return Guarded(agent, state.reference, guard), metrics
 
-    return inner._replace(
-        init=init, init_carry=inner.policy.init_carry, act=act, observe=observe, learn=learn, export=export
-    )
+    changed = {"init": init, "prepare": prepare, "act": act, "observe": observe, "learn": learn, "export": export}
+    return inner._replace(init_carry=inner.policy.init_carry, guarded=True, **changed)

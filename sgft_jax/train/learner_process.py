@@ -29,12 +29,17 @@ class LearnerProcess:
     """
 
     def __init__(
-        self, build: Callable[[], Finetuner], seeds: Array, which: Array, simulated: SimulatedRows | None
+        self, build: Callable[[], Finetuner], seeds: Array, which: Array, simulated: Callable[[], SimulatedRows] | None
     ) -> None:
         spawn = multiprocessing.get_context("spawn")  # a fork would copy JAX in the middle of its work
         self._connection, connection = spawn.Pipe()
         self._cores = cores()
-        args = connection, build, *jax.device_get((seeds, which, simulated)), self._cores[1:] or self._cores
+        args = (
+            connection,
+            build,
+            *jax.device_get((seeds, which, simulated and simulated())),
+            self._cores[1:] or self._cores,
+        )
         self._process = spawn.Process(target=_work, args=args, daemon=True)
         self._process.start()
         connection.close()
@@ -117,9 +122,9 @@ def _work(
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the one that plays, which then ends this one
     pin(allowed)
     give_way()
-    rows = None if simulated is None else jax.tree.map(jnp.asarray, simulated)
+    rows = jax.tree.map(jnp.asarray, simulated)
     try:
-        updates = Updates(build(), jnp.asarray(seeds), jnp.asarray(which), rows)
+        updates = Updates(build(), jnp.asarray(seeds), jnp.asarray(which), lambda: rows)
         connection.send(None)
         while True:
             agent, parts, count, phase = connection.recv()

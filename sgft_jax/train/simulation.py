@@ -49,12 +49,31 @@ def simulate(
     return SimulatedRows(*jax.jit(jax.vmap(one))(priors, keys))
 
 
+def shapes(env: Env, needs: Simulation, priors: int) -> SimulatedRows:
+    """Shapes and types of what `simulate` returns for so many priors."""
+    parts, at_once = _parts(env, needs)
+
+    def one() -> SimulatedRows:
+        return SimulatedRows(_empty(env, parts * at_once), jnp.zeros(parts * at_once))
+
+    return jax.eval_shape(lambda: jax.vmap(lambda _: one())(jnp.zeros(priors)))
+
+
+def _parts(env: Env, needs: Simulation) -> tuple[int, int]:
+    """In how many parts episodes are played, and how many there are in each."""
+    n = -(-needs.transitions // env.episode_length)
+    at_once = min(n, _AT_ONCE)
+    return -(-n // at_once), at_once
+
+
+def _empty(env: Env, episodes: int) -> replay.ReplayState:
+    return replay.init(replay.blank(env.obs_dim, env.act_dim), episodes * env.episode_length)
+
+
 def _simulate(
     env: Env, policy: Policy, pool: World, params: PyTree, key: Key, *, needs: Simulation, gamma: float
 ) -> tuple[replay.ReplayState, Array]:
-    n = -(-needs.transitions // env.episode_length)
-    at_once = min(n, _AT_ONCE)
-    parts = -(-n // at_once)
+    parts, at_once = _parts(env, needs)
 
     def play(key: Key, share: Array) -> Episode:
         def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
@@ -71,7 +90,6 @@ def _simulate(
         rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
         return replay.add_batch(buffer, rows, valid), episodes.total_reward
 
-    empty = replay.init(replay.blank(env.obs_dim, env.act_dim), parts * at_once * env.episode_length)
     shares = jnp.linspace(0.0, needs.ladder, parts * at_once).reshape(parts, at_once)
-    buffer, returns = jax.lax.scan(part, empty, (jax.random.split(key, parts), shares))
+    buffer, returns = jax.lax.scan(part, _empty(env, parts * at_once), (jax.random.split(key, parts), shares))
     return buffer, returns.reshape(-1)

@@ -587,7 +587,7 @@ def test_simulated_data_are_those_of_the_simulator_that_the_prior_comes_from(tmp
     prior, env = load_prior(tmp_path / "seed-0"), toy.make()
     options = {"simulated_share": 0.5, "simulated_transitions": 200}
     setup = api.setup(env, gaps.load(env, "sim"), prior, method="sac", **options)
-    rows = setup.simulated.of(0).draw(jax.random.key(0), 50)
+    rows = setup.simulated().of(0).draw(jax.random.key(0), 50)
     gained = 0.1 * 4.0 * rows.action / 3.0  # dt times force over mass
     np.testing.assert_allclose(rows.next_obs[:, 2:] - rows.obs[:, 2:], gained, atol=1e-5)
 

@@ -189,7 +189,7 @@ def test_methods_that_need_no_prior_start_without_one(name, monkeypatch):
     plain = METHODS[name].build(tuners.configure(name), None, TASK)
     assert plain.simulation is None and plain.initial_policy is None
     state = plain.observe(
-        plain.init(None, jax.random.key(0), None), tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0)
+        plain.init(None, jax.random.key(0)), tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0)
     )
     new, metrics = jax.jit(lambda state: plain.learn(state, jax.random.key(2), 2))(state)
     assert all(jnp.isfinite(x) for x in metrics.values()) and not equal(state.learner, new.learner)
@@ -216,7 +216,7 @@ def seen(monkeypatch):
 def test_horizon_one_learner_sees_the_papers_batch(seen):
     """256 real rows become 1536, nothing bootstraps, and the actor reads the 256."""
     plain = tuners.build("sgft-sac", horizon=1, branches=5, batch_size=256)
-    state = plain.init(prior().params, jax.random.key(0), None)
+    state = plain.init(prior().params, jax.random.key(0))
     jax.eval_shape(lambda state: plain.learn(state, jax.random.key(0), 1, None), state)
     assert seen["batch"].obs.shape == (1536, 2) and seen["config"].actor_batch == 256
     assert seen["batch"].context is None and seen["config"].context_dim == 0
@@ -224,7 +224,7 @@ def test_horizon_one_learner_sees_the_papers_batch(seen):
 
 def test_longer_horizons_tell_the_steps_to_go(seen):
     plain = tuners.build("sgft-sac", horizon=3)
-    state = plain.init(prior().params, jax.random.key(0), None)
+    state = plain.init(prior().params, jax.random.key(0))
     jax.eval_shape(lambda state: plain.learn(state, jax.random.key(0), 1, None), state)
     rows = 8 * (1 + 2 * 3)
     assert seen["batch"].context.shape == (rows, 3) == seen["batch"].next_context.shape
@@ -278,7 +278,7 @@ def test_parts_that_are_a_method_begin_as_it_does_and_see_its_batch(name, others
     shared = {key: value for key, value in others.items() if key != "clip_shaped"}
     for method, options in ((name, others), ("sgft-parts", shared | parts)):
         plain = tuners.build(method, train_dynamics=False, **options)
-        state = plain.init(prior().params, jax.random.key(0), None)
+        state = plain.init(prior().params, jax.random.key(0))
         state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0))
         jax.jit(lambda state, plain=plain: plain.learn(state, jax.random.key(1), 1, None)[0])(state)
         jax.effects_barrier()
@@ -334,7 +334,7 @@ def test_imagined_steps_follow_every_model(monkeypatch):
     plain = tuners.build("mbpo", horizon=1, train_dynamics=False)
     far = jax.tree.map(jnp.copy, params.dynamics)
     far["Dense_1"]["bias"] = far["Dense_1"]["bias"].at[1].add(1000.0)
-    state = plain.init(params._replace(dynamics=far), jax.random.key(0), None)
+    state = plain.init(params._replace(dynamics=far), jax.random.key(0))
     state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0))
     learn = jax.jit(jax.vmap(lambda key: plain.learn(state, key, 1)[1]["batch/reward_mean"]))
     went_far = np.asarray(learn(jax.random.split(jax.random.key(2), 20)) < -100)
@@ -469,7 +469,7 @@ def test_methods_that_imagine_need_functions_of_the_task(missing):
     task = TASK._replace(**{missing: None})
     plain = METHODS["mbpo"].build(tuners.configure("mbpo"), prior(), task)
     with pytest.raises(UserError, match=f"need a task with `{missing}` as a function"):
-        plain.learn(plain.init(prior().params, jax.random.key(0), None), jax.random.key(0), 1, None)
+        plain.learn(plain.init(prior().params, jax.random.key(0)), jax.random.key(0), 1, None)
     METHODS["sac"].build(tuners.configure("sac"), prior(), task)
     with pytest.raises(UserError, match="plans need a task"):
         METHODS["sgft-mpc"].build(tuners.configure("sgft-mpc"), prior(), task)

@@ -276,9 +276,9 @@ def identifying(name):
     def deployed(params, obs):
         return fine.policy.act(params, (), obs, jax.random.key(0), explore=jnp.bool_(False))[0]
 
-    start = functools.partial(jax.jit(lambda params: fine.init(params, jax.random.key(0), data)), prior().params)
+    start = jax.jit(lambda params: fine.prepare(fine.init(params, jax.random.key(0)), data))
     return SimpleNamespace(
-        init=start,
+        init=functools.partial(start, prior().params),
         export=fine.export,
         learned=lambda state: bare.export(state.agent),
         act=jax.jit(deployed),
@@ -346,6 +346,6 @@ def test_learning_offline_decides_nothing():
 
 def test_a_fresh_state_has_buffers_of_its_own():
     case = tuners.tuner("sac", guard=True)
-    state = case.plain.init(case.params, jax.random.key(0), case.data)
+    state = case.plain.init(case.params, jax.random.key(0))
     buffers = [x.unsafe_buffer_pointer() for x in jax.tree.leaves((state, case.params)) if x.size]
     assert len(buffers) == len(set(buffers))

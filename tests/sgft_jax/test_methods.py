@@ -93,8 +93,8 @@ def hyper(fine, name):
     """The learner's numbers at the start."""
     data = tuners.simulated().of(0) if fine.simulation else None
     params = tuners.prior(METHODS[name].prior).params
-    only = jax.jit(lambda key: fine.init(params, key, data).learner.hyper)  # quicker than all of the state
-    return only(jax.random.key(0))
+    # Quicker than all of the state
+    return jax.jit(lambda key: fine.prepare(fine.init(params, key), data).learner.hyper)(jax.random.key(0))
 
 
 @pytest.mark.parametrize(
@@ -201,7 +201,7 @@ def test_without_the_ratio_sgft_relabel_is_what_it_was():
     rows = {"transforms": (*parts, transforms.shorten(2)), "source": lambda state: source}
     critic = {"horizon_dim": 2, "value_baseline": True}
     before = sac_finetuner(options, tuners.prior(), tuners.TASK, **rows, **critic, simulation=case.plain.simulation)
-    start = case.plain.init(case.params, jax.random.key(0), case.data)
+    start = case.plain.prepare(case.plain.init(case.params, jax.random.key(0)), case.data)
     assert program(case, start) == program(case._replace(plain=before), start)
     on = case._replace(plain=tuners.build("sgft-relabel", ratio=True))
     assert program(case, start) != program(on, on.plain.init(case.params, jax.random.key(0), case.data))
@@ -236,7 +236,7 @@ def differs(base, plain):
     params = base.params
 
     def start(fine):
-        return fine.init(params, jax.random.key(0), base.data)
+        return fine.prepare(fine.init(params, jax.random.key(0)), base.data)
 
     shapes = [jax.tree.map(jnp.shape, jax.eval_shape(lambda f=f: start(f))) for f in (base.plain, plain)]
     if shapes[0] != shapes[1]:

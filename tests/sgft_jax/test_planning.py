@@ -305,7 +305,7 @@ def tuner():
     config = sgft_mpc.Config(plan_samples=24, batch_size=32, replay_capacity=64, lr_dynamics=1e-2)
     made = sgft_mpc.build(config, Prior(prior(), {"network": jsonable(NET), "gamma": 0.9}), cast(Task, task))
     compiled = {name: jax.jit(getattr(made, name)) for name in ("observe", "act")}
-    init = jax.jit(lambda params, key: made.init(params, key, None))
+    init = jax.jit(lambda params, key: made.init(params, key))
     return made._replace(init=init, learn=jax.jit(made.learn, static_argnums=2), **compiled)
 
 

@@ -76,7 +76,7 @@ def found(request, prior):
     method = get_method("sysid")
     fine = method.build(method.config(fit=request.param), prior, ENV)
     data = SimulatedData(lambda key, n: steps(prior, key, told=True, n=n, noise=0.003), jnp.zeros(1))
-    state = jax.jit(lambda params, key: fine.init(params, key, data))(prior.params, jax.random.key(0))
+    state = jax.jit(lambda params, key: fine.prepare(fine.init(params, key), data))(prior.params, jax.random.key(0))
     rows = steps(prior, jax.random.key(1), told=False, noise=0.003)
     observe = jax.jit(fine.observe)
     return fine._replace(observe=observe), state, observe(state, *torn(rows, 0.0), jnp.float32(0.0)), data
@@ -117,7 +117,7 @@ def test_the_simulator_tells_the_system_too(prior, fit, key):
     def draw(key, n):
         return jax.tree.map(lambda x: x[jax.random.randint(key, (n,), 0, len(x))], known)
 
-    state = jax.jit(lambda: fine.init(prior.params, key, SimulatedData(draw, jnp.zeros(1))))()
+    state = jax.jit(lambda: fine.prepare(fine.init(prior.params, key), SimulatedData(draw, jnp.zeros(1))))()
     state = jax.jit(fine.observe)(state, *real, jnp.float32(0))
     np.testing.assert_allclose(state.learner[1].mean, TRUE, atol=0.1)
     with pytest.raises(UserError, match="use models"):

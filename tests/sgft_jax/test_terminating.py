@@ -119,7 +119,7 @@ def finetuned(name):
         rows = simulate(ENV, policy, pools, params, jax.random.key(1), fine.simulation, gamma=GAMMA)
     stacked, seeds = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), pools), jnp.arange(M, dtype=jnp.uint32)
     system = Recorded(Simulated(ENV, stacked, seeds // (M // 2), gamma=GAMMA))
-    steps = finetuning.finetune(fine, system, params, seeds, rows, rollouts=2)
+    steps = finetuning.finetune(fine, system, params, seeds, rows and (lambda: rows), rollouts=2)
     yielded = [(copied(progress), metrics) for progress, metrics in steps]
     agent = jax.tree.map(jnp.asarray, yielded[-1][0].agent)
     return Run(fine, rows, [x for x, _ in system.played], yielded, finetuning.evaluate(fine, system, agent, seeds, 1))
@@ -252,7 +252,7 @@ def test_a_method_does_without_functions_of_observations_or_refuses_in_one_line(
 
     def learn(key, data):
         fine = METHODS[name].build(tuners.configure(name), prior, task)
-        state = fine.init(prior.params, key, data)
+        state = fine.prepare(fine.init(prior.params, key), data)
         return fine.learn(state, key, 1, data)[1]
 
     rows = finetuned(name).simulated

@@ -47,7 +47,7 @@ def make(initial_policy=None, simulation=None, initial_rollouts=1, guard=False):
     learner = Learner(lambda key: jnp.float32(0), lambda: jnp.float32(0), act, update)
     parts = Parts(
         learner=learner,
-        start=lambda params, key, simulated: (jnp.float32(0) if params is None else params, None),
+        start=lambda params, key: (jnp.float32(0) if params is None else params, None),
         export=lambda state: state.learner,
         policy=Policy(learner.init_carry, act, lambda params, obs: params),
         source=lambda state: sources.mixture(4, 2) if simulation else sources.real_rows(4),
@@ -89,11 +89,10 @@ def whole():
 def test_every_purpose_of_every_member_draws_from_keys_that_no_other_uses():
     """Beginning, updates before the first rollout and after two, what is played to learn and what to be judged."""
     fine = make(simulation=NEEDS)
-    rows = rows_of(10)
-    learn = finetuning.Updates(fine, SEEDS, finetuning.prior_of(PRIORS, SEEDS), rows)
+    learn = finetuning.Updates(fine, SEEDS, finetuning.prior_of(PRIORS, SEEDS), lambda: rows_of(10))
 
     def whole(key):
-        agent = finetuning.begin(fine._replace(init=drawn), PRIORS, SEEDS, rows).agent
+        agent = finetuning.begin(fine._replace(init=drawn), PRIORS, SEEDS).agent
         for parts, phase in (([0], "offline"), ([1], "logged"), ([0, 1], "online")):
             agent, _ = learn(agent, parts, 1, phase)
         played = [
@@ -102,8 +101,8 @@ def test_every_purpose_of_every_member_draws_from_keys_that_no_other_uses():
         played.append(finetuning._episode_keys(SEEDS, Finetuning.COLLECT, 1, 2))
         return agent, [jax.vmap(jax.vmap(jax.random.normal))(x) for x in played], jax.random.normal(key)
 
-    def drawn(params, key, data):
-        return fine.init(params + jax.random.normal(key), jax.random.key(77), data)
+    def drawn(params, key):
+        return fine.init(params + jax.random.normal(key), jax.random.key(77))
 
     assert keys.used_twice(whole) == 0
 
@@ -410,7 +409,7 @@ def test_a_run_with_logs_goes_on_from_anywhere_with_the_same_bits(tmp_path, monk
     """After 6 and 12 updates on simulated rows, 6 and 8 on the logs, and a rollout: the logs are kept once."""
     monkeypatch.setattr(finetuning, "OFFLINE_PART", 6)
     fine, logged = make(simulation=NEEDS), logs_of(3, 2, updates=8)
-    options = {"simulated": rows_of(10), "rollouts": 2, "logged": logged}
+    options = {"simulated": lambda: rows_of(10), "rollouts": 2, "logged": logged}
     whole = run(fine, **options)
     assert [int(p.offline) for p, _ in whole] == [0, 6, 12, 18, 20, 20, 20]
     for i in range(1, 6):
@@ -525,12 +524,12 @@ def rows_of(n, p=2):
 def test_the_offline_phase_comes_in_parts(monkeypatch):
     monkeypatch.setattr(finetuning, "OFFLINE_PART", 5)
     fine = make(simulation=NEEDS)
-    yielded = run(fine, rollouts=1, simulated=rows_of(10))
+    yielded = run(fine, rollouts=1, simulated=lambda: rows_of(10))
     assert [(int(p.offline), int(p.rollouts)) for p, _ in yielded] == [(0, 0), (5, 0), (10, 0), (12, 0), (12, 1)]
     # its rows are those of each member's own prior: seed 3 has the second one's
     assert [x["batch/reward_mean"].tolist() for _, x in yielded[1:4]] == [[200.0, 100.0]] * 3
     assert "real/return" not in yielded[3][1] and "real/return" in yielded[4][1]
-    rest = run(fine, rollouts=1, simulated=rows_of(10), progress=jax.tree.map(jnp.asarray, yielded[2][0]))
+    rest = run(fine, rollouts=1, simulated=lambda: rows_of(10), progress=jax.tree.map(jnp.asarray, yielded[2][0]))
     assert bits(rest[-1]) == bits(yielded[-1])
 
 
@@ -544,10 +543,10 @@ def test_members_share_simulated_rows():
     """No array of the compiled program holds a set of rows for each member."""
     fine, n, members = make(simulation=NEEDS), 1009, 7
     seeds, simulated = jnp.arange(members, dtype=jnp.uint32), rows_of(n)
-    learning = finetuning.Updates(fine, seeds, finetuning.prior_of(PRIORS, seeds), simulated)
-    states = jax.eval_shape(lambda: finetuning.begin(fine, PRIORS, seeds, simulated)).agent
+    learning = finetuning.Updates(fine, seeds, finetuning.prior_of(PRIORS, seeds), lambda: simulated)
+    states = jax.eval_shape(lambda: finetuning.begin(fine, PRIORS, seeds)).agent
     member_keys = jax.random.split(jax.random.key(0), members)
-    program = learning._learn.lower(states, member_keys, 1, simulated, False, None).as_text()
+    program = learning._learn.lower(states, member_keys, learning.which, 1, simulated, False, None).as_text()
     assert set(re.findall(rf"tensor<([\dx]*){n}x", program)) == {"2x"}  # two priors, no member
 
 

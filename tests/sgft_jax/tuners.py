@@ -120,7 +120,7 @@ def compiled(plain, params):
         return plain.learn(state, key, updates, data, offline=offline)
 
     fine = plain._replace(
-        init=jax.jit(lambda params, key: plain.init(params, key, data)),
+        init=jax.jit(lambda params, key: plain.prepare(plain.init(params, key), data)),
         observe=jax.jit(plain.observe),
         act=jax.jit(plain.act),
         export=jax.jit(plain.export),

@@ -36,7 +36,7 @@ def case():
     plain = tuners.build("sac", identify=True, replay_capacity=64)
     params = tuners.prior().params
     data = SimulatedData(lambda key, n: steps(params, key, distortion.none(2, 2), n), jnp.zeros(1))
-    init = jax.jit(lambda params, key: plain.init(params, key, data))
+    init = jax.jit(lambda params, key: plain.prepare(plain.init(params, key), data))
     fine = plain._replace(init=init, observe=jax.jit(plain.observe), act=jax.jit(plain.act))
     return tuners.Case(plain, fine, data, params, [0])
 
