@@ -62,7 +62,7 @@ def setup(
     method: str = DEFAULT,
     seeds: int | Sequence[int] = 1,
     config: Any = None,
-    rows: Callable[[Simulation, Callable[[], SimulatedRows]], SimulatedRows] = lambda needs, collect: collect(),
+    rows: Callable[[Simulation, Callable[..., SimulatedRows]], SimulatedRows] = lambda needs, collect: collect(),
     **options: Any,
 ) -> Setup:
     """Fine-tuning of seeds on real systems, ready to run.
@@ -70,7 +70,8 @@ def setup(
     real: gaps, which are simulated, or one `System`, such as `Gymnasium`, with a member for each seed.
     priors: one or P of them, or [] to learn from nothing where the method can; seed s starts from prior s modulo P.
     method: a name, or a Python file. seeds: how many, or a list of them. options: of the method, by name; config: all
-    of them as one object instead. rows(needs, collect) -> what `collect()` returns, perhaps kept from an earlier run.
+    of them as one object instead. rows(needs, collect) -> what `collect()` returns, perhaps kept from an earlier run;
+    collect(heard) tells how far it is, see `simulate`.
     Raises UserError for a prior of another algorithm or task, for a missing prior, and for options that do not fit.
     """
     known = [priors] if isinstance(priors, Prior) else list(priors)
@@ -93,11 +94,17 @@ def setup(
     needs = finetuner.simulation
     if needs is None:
         return Setup(finetuner, system, stacked, members, None)
-    simulated = functools.cache(lambda: rows(needs, lambda: _collected(env, needs, known, stacked)))
+    simulated = functools.cache(lambda: rows(needs, functools.partial(_collected, env, needs, known, stacked)))
     return Setup(finetuner, system, stacked, members, simulated)
 
 
-def _collected(env: Env, needs: Simulation, priors: list[Prior], stacked: PyTree) -> SimulatedRows:
+def _collected(
+    env: Env,
+    needs: Simulation,
+    priors: list[Prior],
+    stacked: PyTree,
+    heard: Callable[[float], None] = lambda share: None,
+) -> SimulatedRows:
     """What every prior's policy does where it was trained; always the same.
 
     That is the task's own domain, or the system of the gap that the first card names.
@@ -107,7 +114,7 @@ def _collected(env: Env, needs: Simulation, priors: list[Prior], stacked: PyTree
         gap = from_dict(env, named["name"], {part: named[part] for part in ("params", "effects", "scene")})
         env = real_env(env, [gap])
     worlds = training_worlds(env, gap, key, SIMULATED_WORLDS)
-    return simulate(env, make_policy(card, env), worlds, stacked, key, needs, gamma=card["gamma"])
+    return simulate(env, make_policy(card, env), worlds, stacked, key, needs, gamma=card["gamma"], heard=heard)
 
 
 def check_prior(prior: Prior, method: Online, env: Env) -> None:

@@ -297,10 +297,6 @@ class _Run(Training):
         def played() -> Episode:
             return system.program(who).eval_shape(*playing())
 
-        def judged() -> tuple[Any, ...]:
-            outcome = jax.eval_shape(lambda x: tuple(y[:, 0] for y in (x.score, x.total_reward, x.exploded)), played())
-            return best, agent, *outcome, jnp.int32(0)
-
         rows = None if needs is None else simulation.shapes(system.env, needs, len(jax.tree.leaves(priors)[0]))
         if begins:
             ahead.promise(programs.begin, lambda: (priors, seeds))
@@ -308,8 +304,8 @@ class _Run(Training):
             ahead.promise(system.program(fine.policy if fine.guarded else fine), evaluated)
         ahead.promise(system.program(who), playing)
         if fine.initial_policy is None:
-            ahead.promise(programs.judge, judged)
-        ahead.promise(programs.store, lambda: (agent, played().transitions, played().valid, played().score))
+            ahead.promise(programs.judge, lambda: (best, agent, played(), jnp.int32(0)))
+        ahead.promise(programs.store, lambda: (agent, played()))
         updates = fine.updates_per_rollout
         ahead.promise(programs.learn, lambda: (agent, keys(), which, updates, rows, False, None))
         if begins and needs is not None:
@@ -354,7 +350,7 @@ class _Run(Training):
             system = RecordedSystem(system, stores, done=0, explore=False, sync_every=self.sync_every)
         played = finetuning.evaluate(self.finetuner, system, state.agent, self.seeds, self.episodes)
         self.played = {n: x for n, x in [*self.played.items(), (done, played)] if n in (0, done)}
-        values = scores(played, state.best.worst)
+        values = _scores(played, state.best.worst)
         for record, (score, cost) in self.each((values, np.asarray(played.valid.sum((1, 2))))):
             record.evaluation(done, score, cost)
         return {f"{self.system.env.score}, evaluation": float(values["score"].mean())}
@@ -378,7 +374,7 @@ class _Run(Training):
         if n and self.system.pools is not None:
             with doing("evaluating the best policies", 15, once=True):
                 played = finetuning.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
-            facts["score"] = scores(played, best.worst)["score"]
+            facts["score"] = _scores(played, best.worst)["score"]
         films = functools.cache(lambda: self._before_and_after(progress))
         summaries = []
         for i, record in enumerate(self.records):
@@ -430,6 +426,7 @@ def _learning(learn: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
+_scores: Callable[..., Metrics] = jax.jit(scores)  # one program for a dozen small ones
 _OF_MEMBERS = ("agent", "best", "transitions")  # of a state, what has an axis of members
 
 

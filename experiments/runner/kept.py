@@ -19,6 +19,7 @@ import sgft_jax
 from envs import mesh
 from envs.base import Env
 from envs.types import Transition, UserError
+from experiments.runner import progress
 from experiments.runner.cli import cache_folder
 from experiments.runner.progress import doing
 from sgft_jax.data.replay import ReplayState
@@ -39,9 +40,9 @@ def kept_in(task: str) -> Path | None:
 
 
 def simulated_rows(
-    folder: Path | None, env: Env, priors: Sequence[Prior], needs: Simulation, make: Callable[[], SimulatedRows]
+    folder: Path | None, env: Env, priors: Sequence[Prior], needs: Simulation, make: Callable[..., SimulatedRows]
 ) -> SimulatedRows:
-    """What `make` collects, or the same from disk, where an earlier run with these priors has kept it.
+    """What `make(heard)` collects, or the same from disk, where an earlier run with these priors has kept it.
 
     folder: None keeps nothing. Prints a line where a file is damaged or cannot be written.
     """
@@ -54,7 +55,7 @@ def simulated_rows(
             print(f"{error}; collected anew")
     count = needs.transitions * len(priors)
     with doing(f"collecting {count:,} simulated transitions of the priors", 20 + count / 3_000, once=path is not None):
-        rows = jax.block_until_ready(make())
+        rows = jax.block_until_ready(make(progress.far))
     if path:
         try:
             _write(path, facts, rows)

@@ -19,10 +19,11 @@ _COMPILING = "/jax/core/compile/"  # how the names of the events begin that JAX 
 
 
 class _Phase(NamedTuple):
-    """What happens now, and since when (s, monotonic)."""
+    """What happens now, since when (s, monotonic), and how much of it has been done, as far as that is known."""
 
     words: str
     begun: float
+    far: float | None = None
 
 
 class _Voice:
@@ -57,7 +58,8 @@ class _Voice:
                 self.announce(phase.words, "some seconds")
         elif now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
             more = ", compiling" if compiling() else ""
-            say(f"still {phase.words} ({_duration(lasts)} so far{more})" if lasts >= 1 else phase.words)
+            far = "" if phase.far is None else f"{phase.far:.0%}, ".replace("%", " %")
+            say(f"still {phase.words} ({far}{_duration(lasts)} so far{more})" if lasts >= 1 else phase.words)
 
     def listen(self) -> None:
         """Hears from JAX, once it is imported, when it compiles."""
@@ -107,6 +109,12 @@ def doing(words: str, about: float | None = None, *, once: bool = False) -> Iter
     finally:
         _VOICE.phases.pop()
         _VOICE.idle = _Phase("working", time.monotonic())
+
+
+def far(share: float) -> None:
+    """How much of what happens now has been done, 0 to 1."""
+    if _VOICE.phases:
+        _VOICE.phases[-1] = _VOICE.phases[-1]._replace(far=share)
 
 
 @contextlib.contextmanager

@@ -156,7 +156,8 @@ class Programs(NamedTuple):
     """What `finetune` calls, jitted, of members [M]; those that take a state use it up.
 
     begin(priors, seeds) -> `FinetuneProgress`. prepare(agent, which, rows) -> agent; which: [M] the prior of each.
-    judge, witness: `evidence.judged` and `witnessed`. store(agent, transitions [M, 1, T], valid, score) -> agent.
+    judge(best, agent, episodes [M, 1], age) -> best and witness(best, episodes) -> best: see `evidence.judged` and
+    `witnessed`. store(agent, episodes [M, 1]) -> agent.
     keep(agent, transitions [T], valid, None) -> agent. learn(agent, keys, which, updates, rows, offline, limits) ->
     (agent, metrics).
     """
@@ -176,14 +177,23 @@ def make_programs(finetuner: Finetuner) -> Programs:
     def prepare(state: PyTree, which: Array, rows: SimulatedRows | None) -> PyTree:
         return finetuner.prepare(state, None if rows is None else rows.of(which))
 
-    def store(state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
-        return finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0], score[0])
+    def judge(best: Best, agent: PyTree, played: Episode, age: Array) -> Best:
+        outcome = played.score[:, 0], played.total_reward[:, 0], played.exploded[:, 0]
+        return evidence.judged(finetuner, best, agent, *outcome, age)
+
+    def witness(best: Best, played: Episode) -> Best:
+        return evidence.witnessed(best, played.score[:, 0], played.total_reward[:, 0])
+
+    def store(state: PyTree, played: Episode) -> PyTree:
+        episode = jax.tree.map(lambda x: x[0], played)
+        score = jnp.where(episode.exploded, -jnp.inf, episode.score)
+        return finetuner.observe(state, episode.transitions, episode.valid, score)
 
     return Programs(
         begin=jax.jit(functools.partial(begin, finetuner)),
         prepare=jax.jit(split_vmap(prepare, (0, 0, None)), donate_argnums=0),
-        judge=jax.jit(functools.partial(evidence.judged, finetuner)),
-        witness=jax.jit(evidence.witnessed),
+        judge=jax.jit(judge),
+        witness=jax.jit(witness),
         store=jax.jit(split_vmap(store), donate_argnums=0),
         keep=jax.jit(split_vmap(finetuner.observe, (0, None, None, None)), donate_argnums=0),
         learn=jax.jit(functools.partial(_update, finetuner), static_argnums=(3, 5), donate_argnums=0),
@@ -354,16 +364,14 @@ class _Steps:
         player: that agent, or None, and the rollouts it had learned from.
         """
         for episodes in played:
-            score, total, exploded = (x[:, 0] for x in (episodes.score, episodes.total_reward, episodes.exploded))
             if done or self.finetuner.initial_policy is None:
-                best = self.programs.judge(best, player[0], score, total, exploded, jnp.int32(player[1]))
+                best = self.programs.judge(best, player[0], episodes, jnp.int32(player[1]))
             else:
-                best = self.programs.witness(best, score, total)
+                best = self.programs.witness(best, episodes)
         if not done:
             agent = self.prepare(agent)
         for episodes in played:
-            score = jnp.where(episodes.exploded, -jnp.inf, episodes.score)
-            agent = self.programs.store(agent, episodes.transitions, episodes.valid, score)
+            agent = self.programs.store(agent, episodes)
         return agent, best
 
 
@@ -393,6 +401,7 @@ class _Acting:
         return (self.before, self.rollouts) if self.steps[False] else (None, done)
 
 
+@jax.jit
 def _real(best: Best, played: Sequence[Episode]) -> Metrics:
     """[M] how rollouts [M, 1] went, on average; one that exploded as `best` knows it."""
     facts = [(x.score[:, 0], x.total_reward[:, 0], x.exploded[:, 0]) for x in played]
@@ -404,6 +413,7 @@ def _real(best: Best, played: Sequence[Episode]) -> Metrics:
     }
 
 
+@jax.jit
 def _transitions(played: Sequence[Episode]) -> Array:
     """[n, M] valid steps of rollouts [M, 1]."""
     return jnp.stack([x.valid[:, 0].sum(-1) for x in played]).astype(jnp.int32)

@@ -1,6 +1,7 @@
-"""Simulated data that fine-tuning begins with: whole episodes of every prior's exploring policy. Pure."""
+"""Simulated data that fine-tuning begins with: whole episodes of every prior's exploring policy."""
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -37,26 +38,41 @@ class SimulatedRows(NamedTuple):
 
 
 def simulate(
-    env: Env, policy: Policy, pool: World, priors: PyTree, key: Key, needs: Simulation, *, gamma: float
+    env: Env,
+    policy: Policy,
+    pool: World,
+    priors: PyTree,
+    key: Key,
+    needs: Simulation,
+    *,
+    gamma: float,
+    heard: Callable[[float], None] = lambda share: None,
 ) -> SimulatedRows:
     """Whole episodes of every prior's exploring policy in simulated worlds.
 
     pool: worlds [W] of the training domain. priors: params [P, ...]. needs: how many transitions, and the largest share
     of random actions: in the i-th of n episodes a share i / (n - 1) * needs.ladder of the actions is uniformly random.
+    heard(share) is told from time to time how much of it has been played.
     """
+    parts, at_once = _parts(env, needs)
     keys = jax.random.split(key, jax.tree.leaves(priors)[0].shape[0])
-    one = functools.partial(_simulate, env, policy, pool, needs=needs, gamma=gamma)
-    return SimulatedRows(*jax.jit(jax.vmap(one))(priors, keys))
+    keys = jax.vmap(lambda key: jax.random.split(key, parts))(keys)
+    shares = jnp.linspace(0.0, needs.ladder, parts * at_once).reshape(parts, at_once)
+    one = functools.partial(_simulate, env, policy, pool, gamma=gamma)
+    play = jax.jit(jax.vmap(one, (0, 0, 0, None)), donate_argnums=1)
+    held, returns = jax.jit(functools.partial(_empty, env, parts * at_once, len(keys)))(), []
+    for i in range(parts):
+        held, of_part = jax.block_until_ready(play(priors, held, keys[:, i], shares[i]))
+        returns.append(of_part)
+        heard((i + 1) / parts)
+    return SimulatedRows(held, jnp.concatenate(returns, axis=1))
 
 
 def shapes(env: Env, needs: Simulation, priors: int) -> SimulatedRows:
     """Shapes and types of what `simulate` returns for so many priors."""
     parts, at_once = _parts(env, needs)
-
-    def one() -> SimulatedRows:
-        return SimulatedRows(_empty(env, parts * at_once), jnp.zeros(parts * at_once))
-
-    return jax.eval_shape(lambda: jax.vmap(lambda _: one())(jnp.zeros(priors)))
+    n = parts * at_once
+    return jax.eval_shape(lambda: SimulatedRows(_empty(env, n, priors), jnp.zeros((priors, n))))
 
 
 def _parts(env: Env, needs: Simulation) -> tuple[int, int]:
@@ -66,14 +82,23 @@ def _parts(env: Env, needs: Simulation) -> tuple[int, int]:
     return -(-n // at_once), at_once
 
 
-def _empty(env: Env, episodes: int) -> replay.ReplayState:
-    return replay.init(replay.blank(env.obs_dim, env.act_dim), episodes * env.episode_length)
+def _empty(env: Env, episodes: int, priors: int) -> replay.ReplayState:
+    size = episodes * env.episode_length
+    return jax.vmap(lambda _: replay.init(replay.blank(env.obs_dim, env.act_dim), size))(jnp.arange(priors))
 
 
 def _simulate(
-    env: Env, policy: Policy, pool: World, params: PyTree, key: Key, *, needs: Simulation, gamma: float
+    env: Env,
+    policy: Policy,
+    pool: World,
+    params: PyTree,
+    held: replay.ReplayState,
+    key: Key,
+    shares: Array,
+    *,
+    gamma: float,
 ) -> tuple[replay.ReplayState, Array]:
-    parts, at_once = _parts(env, needs)
+    """One part: what is held with its rows, and the returns of its episodes. shares: [n] of random actions."""
 
     def play(key: Key, share: Array) -> Episode:
         def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
@@ -84,12 +109,6 @@ def _simulate(
 
         return play_episode(env, pool, act, policy.init_carry(), key, gamma=gamma)
 
-    def part(buffer: replay.ReplayState, inputs: tuple[Key, Array]) -> tuple[replay.ReplayState, Array]:
-        key, shares = inputs
-        episodes = jax.vmap(play)(jax.random.split(key, at_once), shares)
-        rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
-        return replay.add_batch(buffer, rows, valid), episodes.total_reward
-
-    shares = jnp.linspace(0.0, needs.ladder, parts * at_once).reshape(parts, at_once)
-    buffer, returns = jax.lax.scan(part, _empty(env, parts * at_once), (jax.random.split(key, parts), shares))
-    return buffer, returns.reshape(-1)
+    episodes = jax.vmap(play)(jax.random.split(key, len(shares)), shares)
+    rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
+    return replay.add_batch(held, rows, valid), episodes.total_reward

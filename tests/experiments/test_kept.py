@@ -30,7 +30,7 @@ def asked(tmp_path, priors):
     """asked(...) -> the rows, and whether they were collected for it; each collection has numbers of its own."""
     count = 0
 
-    def collect():
+    def collect(heard):
         nonlocal count
         count += 1
         rows = Transition(*(jnp.arange(12.0).reshape(1, 6, 2) + jnp.float32(count) for _ in Transition._fields))
