@@ -1,4 +1,4 @@
-"""The whole idea in two minutes on a CPU: a policy fails on a "real" system and is fine-tuned, with and without SGFT."""
+"""The idea in two minutes on a CPU: a policy fails on a "real" system and is fine-tuned, with and without SGFT."""
 
 import contextlib
 import multiprocessing
@@ -32,8 +32,8 @@ class DemoArgs:
     task: str = "insert"
     """A task by name."""
     prior: Path = Path("shipped:insert-cpu")
-    """Folder of a prior. The default is what `pretrain --task insert --preset cpu` makes in two minutes: a weak one, from
-    which methods differ (docs/results.md)."""
+    """Folder of a prior. The default is what `pretrain --task insert --preset cpu` makes in two minutes: a weak
+    one, where methods differ (docs/results.md)."""
     real: str = "default"
     """The real system, as in fine-tuning."""
     seeds: int = 3

@@ -310,7 +310,10 @@ class _Run(Training):
         ahead.promise(programs.learn, lambda: (agent, keys(), which, updates, rows, False, None))
         if begins and needs is not None:
             ahead.promise(programs.prepare, lambda: (agent, which, rows))
-        compiles = functools.partial(doing, "compiling what learns", 40, once=True)
+
+        def compiles() -> contextlib.AbstractContextManager[None]:
+            return doing("compiling what learns", 40, once=True)
+
         waits = Programs(*[ahead.awaited(program, compiles) for program in programs])
         soon = {x: ahead.awaited(getattr(programs, x), contextlib.nullcontext) for x in ("begin", "judge")}
         return waits._replace(learn=_learning(waits.learn), **soon)

@@ -533,6 +533,17 @@ def test_the_offline_phase_comes_in_parts(monkeypatch):
     assert bits(rest[-1]) == bits(yielded[-1])
 
 
+def test_simulated_rows_are_asked_for_once_the_first_rollout_has_been_played():
+    system, asked = Recorded(simulated()), []
+
+    def rows():
+        asked.append(len(system.played))
+        return rows_of(10)
+
+    run(make(simulation=NEEDS._replace(offline_updates=0)), system, rollouts=2, simulated=rows)
+    assert asked[0] == 1
+
+
 def test_methods_that_need_simulated_data_say_so():
     with pytest.raises(UserError, match="pass `simulated`"):
         run(make(simulation=NEEDS), rollouts=1)
