@@ -69,6 +69,11 @@ def _kept(count: int) -> list[_Process]:
         return _KEPT[:count]
 
 
+def running() -> int:
+    """How many processes stay for tasks."""
+    return sum(map(_Process.alive, _KEPT))
+
+
 @atexit.register
 def _end_kept() -> None:
     for process in _KEPT:

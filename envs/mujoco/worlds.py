@@ -17,12 +17,13 @@ import mujoco
 import numpy as np
 
 from envs.mujoco.engines import CARRIED, Engine, carried, comparison
-from envs.mujoco.processes import cores, in_parallel
+from envs.mujoco.processes import cores, in_parallel, running
 from envs.types import Array, UserError, brief, unknown
 
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
 IMPL_VARIABLE = "SGFT_IMPL"
 WORTH = 256  # worlds for which a process is worth its start, which takes as long
+_FEW = 16  # worlds for which a process that runs is worth asking
 # MuJoCo's kinds of state that a step continues with a `PhysicsState`, or that no step of ours ever changes.
 _KEPT = ("TIME", "QPOS", "QVEL", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE")
 _STATES = {
@@ -116,7 +117,7 @@ def compile_worlds(
     Raises UserError when MuJoCo refuses a spec, or when one differs from the nominal scene in anything else that a step
     reads: in its structure, which a compiled program cannot follow, or in what was the same in `varying_fields`.
     """
-    count, parts = min(cores(), len(thetas) // WORTH), None
+    count, parts = min(cores(), max(len(thetas) // WORTH, min(len(thetas) // _FEW, running()))), None
     if count > 1:
         shares = [thetas[len(thetas) * i // count : len(thetas) * (i + 1) // count] for i in range(count)]
         parts = in_parallel(_share, [(build, theta, share, names) for share in shares], keep=True)

@@ -12,24 +12,22 @@ from envs.mujoco.processes import cores
 class Ahead:
     """Jitted programs that compile before they are called: a call then finds the compiled one in JAX's own cache.
 
-    XLA compiles outside of Python's lock, so as many programs compile at a time as there are cores.
+    Python traces one after another. XLA compiles outside of Python's lock, so as many compile at a time as there are
+    cores.
     """
 
-    def __init__(self, threads: ThreadPoolExecutor) -> None:
-        self._threads = threads
+    def __init__(self, tracer: ThreadPoolExecutor, threads: ThreadPoolExecutor) -> None:
+        self._tracer, self._threads = tracer, threads
         self._begun: dict[Callable[..., Any], list[Future[Any]]] = {}
 
     def begin(self, function: Callable[[], Any]) -> None:
         """Begins to call a function in a thread."""
         self._submit(function, function)
 
-    def compile(self, program: Any, *args: Any) -> None:
-        """Begins to compile a jitted program for these arguments, or for their shapes (see `jax.eval_shape`)."""
-        self._submit(program, program.lower(*args).compile)
-
     def promise(self, program: Any, args: Callable[[], tuple[Any, ...]]) -> None:
-        """The same with arguments that a thread works out: it traces the program, too."""
-        self._submit(program, lambda: program.lower(*args()).compile())
+        """Begins to compile a jitted program. args() -> its arguments, or their shapes (see `jax.eval_shape`)."""
+        lowered = self._tracer.submit(lambda: program.lower(*args()))
+        self._submit(program, lambda: lowered.result().compile())
 
     def awaited(self, program: Any, waiting: Callable[[], AbstractContextManager[None]]) -> Callable[..., Any]:
         """The program, called when it has been compiled. waiting() says that it has not been yet."""
@@ -59,8 +57,10 @@ class Ahead:
 @contextlib.contextmanager
 def compiling() -> Iterator[Ahead]:
     """Threads for a block; what has not begun when it is left, as by an error, never begins."""
-    threads = ThreadPoolExecutor(cores(), thread_name_prefix="compile")  # more would take memory alone
+    # More than there are cores would take memory alone.
+    pools = [ThreadPoolExecutor(count, thread_name_prefix="compile") for count in (1, cores())]
     try:
-        yield Ahead(threads)
+        yield Ahead(*pools)
     finally:
-        threads.shutdown(wait=False, cancel_futures=True)
+        for pool in pools:
+            pool.shutdown(wait=False, cancel_futures=True)

@@ -19,7 +19,7 @@ from envs.base import Env, World
 from envs.domains import with_actuators
 from envs.gaps import SIM, Gap
 from envs.observations import blurred, varying, with_system
-from envs.rollout import Episode, heldout_worlds, load_gap, real_env, training_worlds
+from envs.rollout import Episode, heldout_worlds, load_gap, pool_size, real_env, training_worlds
 from envs.types import PyTree
 from experiments.runner.ahead import Ahead, compiling
 from experiments.runner.cli import as_typed
@@ -47,6 +47,14 @@ if TYPE_CHECKING:
 
 _CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
 _HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
+
+
+class Shapes(NamedTuple):
+    """Shapes and types of worlds [seeds, W], experience under random actions and state: what a chunk takes."""
+
+    worlds: World
+    random: PyTree
+    state: FleetState
 
 
 class Saved(NamedTuple):
@@ -101,13 +109,16 @@ class _Run(Training):
         """Everything, in order."""
         with compiling() as ahead:
             ahead.begin(self.env.prepare)
-            self._build()
             state, done = None, 0
-            for saved, meta in self.restore(lambda: jax.eval_shape(self._saved, self.shapes()[1])):
+            for saved, meta in self.restore(lambda: jax.eval_shape(self._saved, self.shapes().state)):
                 (state, self.best), self.clock.seconds, done = saved, meta["seconds"], meta["env_steps"]
-            if mesh.pieces() == 1:  # threads would know nothing of a mesh
+            alone = mesh.pieces() == 1  # threads would know nothing of a mesh
+            if alone:
+                self._compile(ahead, begins=state is None)
+            self._build()
+            if alone:
                 with self.announced(None):
-                    self._compile(ahead, begins=state is None)
+                    self._compile_evaluations(ahead)
             data = {"pools": self.pools, "random": self._random(ahead), "programs": self.programs}
             with self.announced(None):
                 ahead.wait(self.programs.train.init, self.programs.train.chunk, self.heldout.program(self.policy))
@@ -131,24 +142,35 @@ class _Run(Training):
         self.heldout = Simulated(self.env, heldout, jnp.zeros(self.count, jnp.int32), gamma=self.config.gamma)
 
     def _compile(self, ahead: Ahead, *, begins: bool) -> None:
-        """Begins to compile all programs, first what takes longest."""
-        n, worlds, (random, state) = self.config.eval_episodes, self.pools(0), self.shapes()
-        params = jax.eval_shape(functools.partial(pretraining.exported, self.env, self.config), state)
-        keys = jnp.broadcast_to(jax.random.split(jax.random.key(0), n), (self.count, n))
-        ahead.compile(self.programs.train.chunk, worlds, random, state)
+        """Begins to compile what trains, first what takes longest, while the worlds are still being built."""
+        collect, (init, chunk, _) = self.programs
+        random, start = (seed_keys(self.seeds, purpose) for purpose in (Pretraining.RANDOM, Pretraining.START))
+        ahead.promise(chunk, self.shapes)
         if begins:
-            ahead.compile(self.programs.collect, worlds, seed_keys(self.seeds, Pretraining.RANDOM))
-            ahead.compile(self.programs.train.init, worlds, random, seed_keys(self.seeds, Pretraining.START))
-        ahead.compile(self.heldout.program(self.policy), params, self.heldout.pools, self.heldout.which, keys, False)
+            ahead.promise(collect, lambda: (self.shapes().worlds, random))
+            ahead.promise(init, lambda: (self.shapes().worlds, self.shapes().random, start))
+
+    def _compile_evaluations(self, ahead: Ahead) -> None:
+        """Begins to compile what plays and measures."""
+        n, system, report = self.config.eval_episodes, self.heldout, seed_keys(self.seeds, Pretraining.REPORT)
+        keys = jnp.broadcast_to(jax.random.split(jax.random.key(0), n), (self.count, n))
+
+        def params() -> PyTree:
+            return jax.eval_shape(functools.partial(pretraining.exported, self.env, self.config), self.shapes().state)
+
+        ahead.promise(system.program(self.policy), lambda: (params(), system.pools, system.which, keys, False))
         if self.reports:
-            ahead.compile(self.measure, worlds, params, seed_keys(self.seeds, Pretraining.REPORT))
+            ahead.promise(self.measure, lambda: (self.shapes().worlds, params(), report))
         ahead.begin(functools.partial(importlib.import_module, "tensorboardX"))  # seconds, where PyTorch is installed
 
-    def _shapes(self) -> tuple[PyTree, FleetState]:
-        """Shapes and types of the random experience and of the state: what checkpoints are read into."""
-        worlds, programs = self.pools(0), self.programs
-        random = programs.collect.eval_shape(worlds, seed_keys(self.seeds, Pretraining.RANDOM))
-        return random, programs.train.init.eval_shape(worlds, random, seed_keys(self.seeds, Pretraining.START))
+    def _shapes(self) -> Shapes:
+        """What programs are compiled for and checkpoints are read into."""
+        random, start = (seed_keys(self.seeds, purpose) for purpose in (Pretraining.RANDOM, Pretraining.START))
+        few = training_worlds(self.env, self.gap, jax.random.key(0), 2)
+        n = self.config.worlds if pool_size(few) == 2 else 1  # one, where nothing varies
+        worlds = jax.tree.map(lambda x: jax.ShapeDtypeStruct((self.count, n, *x.shape[1:]), x.dtype), few)
+        experience = self.programs.collect.eval_shape(worlds, random)
+        return Shapes(worlds, experience, self.programs.train.init.eval_shape(worlds, experience, start))
 
     def _pools(self, number: int) -> World:
         """The worlds [seeds, W] of a set."""
@@ -164,7 +186,7 @@ class _Run(Training):
         """Experience under random actions: collected once, then read from disk."""
         folder, expect = self.record.home / "random", self.record.expect
         if checkpoint.latest(folder) is not None:
-            return checkpoint.restore(folder, self.shapes()[0], expect=expect)[0]
+            return checkpoint.restore(folder, self.shapes().random, expect=expect)[0]
         count = self.count * self.config.random_transitions
         with self.clock("random"), doing(f"collecting {count:,} random transitions", 15 + count / 200_000, once=True):
             ahead.wait(self.env.prepare, self.programs.collect)

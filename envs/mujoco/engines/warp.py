@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from envs.mujoco.engines import Engine, check_features
-from envs.mujoco.engines.mjx import mjx, put, with_fields
+from envs.mujoco.engines.mjx import mjx, put
 from envs.types import Array, PyTree, UserError
 
 # Newton iterations beyond the scene's. After the hardest pushes on the puck, one control step in a hundred, 4 of them
@@ -24,7 +24,6 @@ from envs.types import Array, PyTree, UserError
 # converged to a micrometre. Worlds stop once they have, so more cost little.
 _MORE_ITERATIONS = 4
 _STATE = ("qpos", "qvel", "qacc_warmstart")
-_POSES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat")
 
 
 def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
@@ -39,7 +38,6 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
     check_features("warp", host)
     warp_worlds.check(host, fields)
     contacts, rows = budget(host)
-    still, at_rest = put(host)
     ends = np.cumsum([host.nq, host.nv, host.nv])
 
     size = {"contacts": contacts, "rows": rows, "iterations": iterations(host)}
@@ -50,20 +48,13 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
         return warp_worlds.make_call(host, layout, move=move, **size)
 
     def prepare() -> None:
-        layout = (*_STATE, *_POSES, *warp_worlds.as_read(dict.fromkeys(fields, jnp.ones(1))))
+        layout = (*_STATE, *warp_worlds.as_read(dict.fromkeys(fields, jnp.ones(1))))
         warp_worlds.compile_kernels(host, layout, **size)
-
-    def placed(values: dict[str, Array], qpos: Array) -> dict[str, Array]:
-        """Where everything is. Warp leaves what is fixed to the world where it was when its data were made."""
-        with jax.default_matmul_precision("highest"):
-            data = mjx.kinematics(with_fields(still, values), at_rest.replace(qpos=qpos))
-        return {name: getattr(data, name) for name in _POSES}
 
     def batch(values: dict[str, Array], state: Any, controls: Array, *, move: bool) -> Any:
         """Worlds [n] after steps under controls [n, steps, nu], or, unless they move, what their sensors read."""
         n = len(controls)
         parts = dict(zip(_STATE, (state.qpos, state.qvel, state.warmstart), strict=True))
-        parts |= jax.vmap(placed)(values, state.qpos)
         parts |= warp_worlds.as_read(values)
         packed = jnp.concatenate([x.reshape(n, -1) for x in parts.values()], axis=1)
         qpos, qvel, warmstart, sensordata = jnp.split(call(tuple(parts), move)(packed, controls), ends, axis=1)

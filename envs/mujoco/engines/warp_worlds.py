@@ -7,9 +7,13 @@ the worlds' own, so it never has to be captured again.
 """
 
 import contextlib
+import dataclasses
+import hashlib
 import math
+import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -22,7 +26,7 @@ from envs.types import Array, UserError
 
 wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads
 
-_PROCESSES = 4  # that compile kernels: each takes some 10 s to start, and 0.5 GB of the GPU
+_PROCESSES = 6  # that compile kernels: each takes some 10 s to start, and 0.5 GB of the GPU
 
 # Lost contacts and constraints; a solver that used up its iterations is how we run it.
 _LOSSES = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
@@ -88,11 +92,14 @@ class Worlds:
             floats = self._own(name, n)
             self.places.append((floats, start, start + floats.shape[1]))
             start += floats.shape[1]
+        # Warp leaves geoms that are fixed to the world where they were when its data were made: here none is fixed.
+        self.unfixed = dataclasses.replace(self.model, body_weldid=wp.full(host.nbody, 1, dtype=int))
 
     def load(self, packed: wp.array) -> None:
         """packed: [n, floats] as `layout` says."""
         for floats, start, stop in self.places:
             wp.copy(floats, packed[:, start:stop])
+        mjw.kinematics(self.unfixed, self.data)
         self.lost.zero_()
 
     def sense(self, ctrl: wp.array) -> None:
@@ -175,14 +182,21 @@ def make_call(
 
 
 def compile_kernels(host: mujoco.MjModel, layout: Sequence[str], **size: int) -> None:
-    """Compiles the kernels of a step in several processes, into Warp's cache.
+    """Compiles the kernels of a step in several processes, into Warp's cache, unless a note there says they have.
 
     Warp makes kernels as a step goes along, and would compile one module after another, each at its first launch:
     during which XLA, which waits for the step, tries no kernels of other programs either.
     """
-    if wp.is_cuda_available():
+    if not wp.is_cuda_available():
+        return
+    facts = pickle.dumps((mujoco.__version__, wp.get_device("cuda").arch, host, layout, size))
+    # Empty, and named so that it goes when somebody empties Warp's cache.
+    note = Path(wp.config.kernel_cache_dir) / f"wp_sgft_{hashlib.sha256(facts).hexdigest()[:16]}"
+    if not note.exists():
         count = min(cores(), _PROCESSES)
-        in_parallel(_compile_share, [(host, layout, size, i, count) for i in range(count)], keep=False)
+        tasks = [(host, layout, size, i, count) for i in range(count)]
+        if in_parallel(_compile_share, tasks, keep=False) is not None:
+            note.mkdir(exist_ok=True)
 
 
 def _compile_share(host: mujoco.MjModel, layout: Sequence[str], size: dict[str, int], i: int, count: int) -> None:
