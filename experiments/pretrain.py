@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from envs import extend, gaps
 from envs.gaps import SIM
 from envs.types import UserError
-from experiments.runner import cli
+from experiments.runner import ahead, cli
 from experiments.runner.options import Impl, Out, Task, check_task, hosts_of, not_negative, seed_list, seeds_name
 from sgft_jax.io.runs import check_start
 from sgft_jax.presets import DEFAULT_PRESET, PRESETS, PretrainConfig
@@ -74,7 +74,8 @@ def _defaults(argv: Sequence[str]) -> PretrainArgs:
 def pretrain(args: PretrainArgs) -> dict[str, Any]:
     """One run from (or back) to disk; returns its summary."""
     seeds = check(args)
-    from experiments.runner.pretrain_run import run  # JAX starts here
+    ahead.start(args.config.worlds, devices=args.hosts is None)
+    from experiments.runner.pretrain_run import run
 
     return run(args, seeds, run_folder(args))
 

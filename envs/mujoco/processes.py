@@ -6,6 +6,7 @@ exchange pickles, which may run code, by a socket that no third process can reac
 
 import atexit
 import contextlib
+import importlib
 import os
 import pickle
 import select
@@ -17,6 +18,8 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
+
+WORTH = 256  # worlds for which a process is worth its start, which takes as long
 
 
 class _Process:
@@ -67,6 +70,17 @@ def _kept(count: int) -> list[_Process]:
         _KEPT[:] = filter(_Process.alive, _KEPT)
         _KEPT.extend(_Process() for _ in range(count - len(_KEPT)))
         return _KEPT[:count]
+
+
+def begin(worlds: int) -> None:
+    """Starts the processes that will compile so many worlds, which import what they need meanwhile."""
+    if (count := min(cores(), worlds // WORTH)) > 1:
+        tasks = [("envs.mujoco.worlds",)] * count
+        threading.Thread(target=in_parallel, args=(_prepare, tasks), kwargs={"keep": True}).start()
+
+
+def _prepare(module: str) -> None:
+    importlib.import_module(module)
 
 
 def running() -> int:

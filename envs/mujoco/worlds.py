@@ -17,12 +17,11 @@ import mujoco
 import numpy as np
 
 from envs.mujoco.engines import CARRIED, Engine, carried, comparison
-from envs.mujoco.processes import cores, in_parallel, running
+from envs.mujoco.processes import WORTH, cores, in_parallel, running
 from envs.types import Array, UserError, brief, unknown
 
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
 IMPL_VARIABLE = "SGFT_IMPL"
-WORTH = 256  # worlds for which a process is worth its start, which takes as long
 _FEW = 16  # worlds for which a process that runs is worth asking
 # MuJoCo's kinds of state that a step continues with a `PhysicsState`, or that no step of ours ever changes.
 _KEPT = ("TIME", "QPOS", "QVEL", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE")

@@ -1,12 +1,30 @@
-"""Impure: programs that compile in threads, beside each other and beside what the main thread does."""
+"""Impure: what takes seconds and can be done beside something else: starting, tracing and compiling."""
 
 import contextlib
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import Any
 
-from envs.mujoco.processes import cores
+from envs.mujoco import processes
+
+
+def start(worlds: int, *, devices: bool) -> None:
+    """Begins what a command needs after its imports: processes that compile so many worlds, and JAX's devices.
+
+    devices: not where several hosts must meet first.
+    """
+    processes.begin(worlds)
+    import jax
+
+    def first() -> None:
+        with contextlib.suppress(Exception):  # it fails again where somebody reads it
+            jax.numpy.zeros(()).block_until_ready()
+
+    if devices:
+        threading.Thread(target=first).start()
 
 
 class Ahead:
@@ -58,9 +76,12 @@ class Ahead:
 def compiling() -> Iterator[Ahead]:
     """Threads for a block; what has not begun when it is left, as by an error, never begins."""
     # More than there are cores would take memory alone.
-    pools = [ThreadPoolExecutor(count, thread_name_prefix="compile") for count in (1, cores())]
+    pools = [ThreadPoolExecutor(count, thread_name_prefix="compile") for count in (1, processes.cores())]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(interval / 10)  # the main thread makes hundreds of calls to Warp, and waits at each of them
     try:
         yield Ahead(*pools)
     finally:
+        sys.setswitchinterval(interval)
         for pool in pools:
             pool.shutdown(wait=False, cancel_futures=True)

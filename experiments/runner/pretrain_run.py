@@ -49,6 +49,11 @@ _CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
 _HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
 
 
+# One program instead of one for every field.
+_stacked = jax.jit(stacking.stack)
+_levels = jax.jit(lambda best: (best.score, best.total))
+
+
 class Shapes(NamedTuple):
     """Shapes and types of worlds [seeds, W], experience under random actions and state: what a chunk takes."""
 
@@ -136,7 +141,7 @@ class _Run(Training):
         with self.clock("worlds"), doing(f"building {count:,} worlds", 3 + 0.01 * count):
             self.pools(0)
             heldout, self.final = (
-                stacking.stack([heldout_worlds(self.env, self.gap, jax.random.key(seed), n)])
+                _stacked([heldout_worlds(self.env, self.gap, jax.random.key(seed), n)])
                 for seed in (_HELDOUT_SEED, _FINAL_SEED)
             )
         self.heldout = Simulated(self.env, heldout, jnp.zeros(self.count, jnp.int32), gamma=self.config.gamma)
@@ -175,7 +180,7 @@ class _Run(Training):
     def _pools(self, number: int) -> World:
         """The worlds [seeds, W] of a set."""
         keys = pretraining.world_keys(self.seeds, number)
-        return stacking.stack([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
+        return _stacked([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
 
     def _saved(self, state: FleetState) -> Saved:
         """What a first checkpoint holds."""
@@ -232,19 +237,20 @@ class _Run(Training):
                     report = self._report(best.params)
             with doing("playing fresh episodes for the cards", 5):
                 played = self._final_episodes(best.params)
-        best, results = jax.device_get(best), []
+        (score, total), best, results = *jax.device_get((_levels(best), best)), []
         for i, seed in enumerate(self.seeds):
             chosen = stacking.member(best, i)
             name = digest(Prior(chosen.params, {}))  # by which runs of fine-tuning tell which priors they began from
             facts = {"seed": seed, "digest": name, **describe(stacking.member(played, i))}
             facts["best/env_steps"] = int(chosen.age) * self.config.n_envs
-            facts |= {f"best/{self.env.score}": float(chosen.score), "best/return": float(chosen.total)}
+            facts |= {f"best/{self.env.score}": float(score[i]), "best/return": float(total[i])}
             if report is not None:
                 facts |= numbers(stacking.member(report, i))
-                self._save_report(seed, stacking.member(report, i), i)
             results.append(facts)
         cards = {facts["seed"]: self._card(facts) for facts in results}
         self.record.save_policies("prior", best.params, cards.__getitem__)
+        for i, seed in enumerate(self.seeds if report is not None else []):
+            self._save_report(seed, stacking.member(report, i), i)
         summary = {
             "task": self.env.name,
             "preset": self.args.preset,

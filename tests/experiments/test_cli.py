@@ -384,7 +384,8 @@ def test_choose():
 
 
 def test_set_up_keeps_what_the_user_has_set():
-    chosen = "--xla_gpu_triton_gemm_any=false --xla_backend_optimization_level=3"
+    chosen = "--xla_gpu_triton_gemm_any=false --xla_gpu_command_buffer_scheduling_mode=LHS"
+    chosen += " --xla_backend_optimization_level=3"
     os.environ.update(XLA_FLAGS=chosen, JAX_COMPILATION_CACHE_DIR="/mine")
     cli.set_up()
     assert os.environ["XLA_FLAGS"] == chosen
@@ -399,6 +400,7 @@ def test_set_up_adds_each_flag_once(monkeypatch, gpu):
     cli.set_up()
     cli.set_up()
     flags = ["--xla_force_host_platform_device_count=2", "--xla_gpu_triton_gemm_any=true"]
+    flags += ["--xla_gpu_command_buffer_scheduling_mode=CONCURRENT"]
     assert os.environ["XLA_FLAGS"].split() == flags + ["--xla_backend_optimization_level=1"] * (not gpu)
 
 
