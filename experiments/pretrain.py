@@ -74,7 +74,7 @@ def _defaults(argv: Sequence[str]) -> PretrainArgs:
 def pretrain(args: PretrainArgs) -> dict[str, Any]:
     """One run from (or back) to disk; returns its summary."""
     seeds = check(args)
-    ahead.start(args.config.worlds, devices=args.hosts is None)
+    ahead.start(args.config.worlds * args.seeds, devices=args.hosts is None)
     from experiments.runner.pretrain_run import run
 
     return run(args, seeds, run_folder(args))

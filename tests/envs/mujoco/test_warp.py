@@ -1,6 +1,7 @@
 """MuJoCo Warp, here on the CPU, against C MuJoCo: one control period from each state of scripted episodes."""
 
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -166,3 +167,15 @@ def test_lost_contacts_are_explosions(monkeypatch):
     world = jax.tree.map(lambda x: x[0], worlds)
     _, states = jax.jit(lambda key: hammer(env, world, key))(jax.random.key(1))
     assert states.invalid.any() and not states.invalid[0]
+
+
+def test_kernels_compile_in_processes_until_they_are_in_the_cache(monkeypatch, tmp_path):
+    warp_worlds, answers = pytest.importorskip("envs.mujoco.engines.warp_worlds"), iter([None, [None], [None]])
+    monkeypatch.setattr(warp_worlds.wp, "is_cuda_available", lambda: True)
+    monkeypatch.setattr(warp_worlds.wp, "get_device", lambda _: SimpleNamespace(arch=90))
+    monkeypatch.setattr(warp_worlds.wp.config, "kernel_cache_dir", str(tmp_path))
+    monkeypatch.setattr(warp_worlds, "in_parallel", lambda *_, **__: next(answers))
+    host = mujoco.MjModel.from_xml_string("<mujoco/>")
+    for rows, notes in ((1, 0), (1, 1), (1, 1), (2, 2)):  # failed; compiled; nothing to do; another size
+        warp_worlds.compile_kernels(host, ["qpos"], rows=rows)
+        assert len(list(tmp_path.iterdir())) == notes
