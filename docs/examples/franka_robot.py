@@ -61,6 +61,6 @@ def main(camera: Any, token: str) -> None:
         "ws://127.0.0.1:8765",
         token=token,
         period=0.2,
-        log="commands.log",
+        log="commands.msgpack",
         limits=robot_client.Limits(low=-0.2, high=0.2),
     )
