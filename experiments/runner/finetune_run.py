@@ -286,7 +286,7 @@ class _Run(Training):
             return jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (len(seeds), *shape)))
 
         def evaluated() -> tuple[Any, ...]:
-            states = jax.eval_shape(jax.vmap(fine.export), agent) if fine.guarded else agent
+            states = jax.eval_shape(jax.vmap(fine.export), agent)
             return states, system.pools, system.which, keys(self.episodes), False
 
         def playing() -> tuple[Any, ...]:
@@ -301,7 +301,7 @@ class _Run(Training):
         if begins:
             ahead.promise(programs.begin, lambda: (priors, seeds))
         if self.episodes:
-            ahead.promise(system.program(fine.policy if fine.guarded else fine), evaluated)
+            ahead.promise(system.program(fine.policy), evaluated)
         ahead.promise(system.program(who), playing)
         if fine.initial_policy is None:
             ahead.promise(programs.judge, lambda: (best, agent, played(), jnp.int32(0)))

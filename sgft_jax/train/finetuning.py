@@ -127,9 +127,10 @@ def offline_parts(finetuner: Finetuner, offline: int) -> int:
 def evaluate(policy: Any, system: System, states: PyTree, seeds: Array, episodes: int) -> Episode:
     """Episodes [M, episodes] without exploration, the same ones at every call: a fixed series for each seed.
 
-    policy, states: see `System.play`; for a `Finetuner` the states are `FinetuneProgress.agent`.
+    policy, states: see `System.play`; for a `Finetuner` the states are `FinetuneProgress.agent`, of which what they
+    export plays: one program for agents and the best policies.
     """
-    if isinstance(policy, Finetuner) and policy.guarded:  # one program plays agents and the best policies
+    if isinstance(policy, Finetuner):
         policy, states = policy.policy, exported(policy.export, states)
     return system.play(policy, states, _episode_keys(seeds, Finetuning.EVALUATE, 0, episodes), explore=False)
 

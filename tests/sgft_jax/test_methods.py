@@ -4,6 +4,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 import tuners
 from tuners import METHODS, T
@@ -205,6 +206,20 @@ def test_without_the_ratio_sgft_relabel_is_what_it_was():
     assert program(case, start) == program(case._replace(plain=before), start)
     on = case._replace(plain=tuners.build("sgft-relabel", ratio=True))
     assert program(case, start) != program(on, on.plain.init(case.params, jax.random.key(0), case.data))
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize("name", METHODS)
+def test_what_is_exported_acts_as_the_agent_does(name):
+    """So evaluations play what is saved, in one program."""
+    case = tuners.tuner(name)
+    state, _ = case.fine.learn(tuners.started(case), jax.random.key(3))
+    params, carries = case.fine.export(state), [case.fine.init_carry(), case.plain.policy.init_carry()]
+    for i, obs in enumerate(jnp.array([[0.3, -0.8], [0.1, 0.5], [-0.7, 0.2]])):
+        key = jax.random.key(i)
+        action, carries[0] = case.fine.act(state, carries[0], obs, key, explore=False)
+        exported, carries[1] = case.plain.policy.act(params, carries[1], obs, key, explore=False)
+        np.testing.assert_allclose(action, exported, atol=1e-6)
 
 
 def facts(fine):
