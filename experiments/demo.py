@@ -16,6 +16,7 @@ from experiments.finetune import finetune
 from experiments.runner import cli
 from experiments.runner.finetune_args import FinetuneArgs, arguments, check, priors_of, run_folder
 from experiments.runner.options import check_task
+from experiments.runner.progress import doing
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import get_method
 
@@ -110,7 +111,8 @@ def _finetune_all(first: FinetuneArgs, *others: FinetuneArgs) -> None:
     beside.start()
     try:
         finetune(first)
-        beside.join()
+        with doing(f"waiting for {' and '.join(args.method for args in others)}"):
+            beside.join()
     finally:
         beside.kill()  # it has ended, unless the run above has failed
     if beside.exitcode:
