@@ -37,7 +37,7 @@ class DemoArgs:
     one, where methods differ (docs/results.md)."""
     real: str = "default"
     """The real system, as in fine-tuning."""
-    seeds: int = 3
+    seeds: int = 2
     """Fine-tuning seeds per method."""
     rollouts: int = 10
     """Real rollouts per seed, the initial ones included."""

@@ -108,7 +108,7 @@ def dressed(scene: Scene, theta: dict[str, float]) -> mujoco.MjSpec:
     _add_lights(spec, follow=scene.view.follow if scene.view else "")
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.02, 20
-    visual.quality.shadowsize, visual.quality.offsamples = 2048, 0
+    visual.quality.shadowsize, visual.quality.offsamples = 1024, 0
     visual.map.shadowclip = 3  # shadows reach further than the picture: MuJoCo draws stripes where they end
     visual.global_.offheight, visual.global_.offwidth = (SUPERSAMPLING * n for n in SIZE)
     return spec
