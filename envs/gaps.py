@@ -22,7 +22,7 @@ from envs.files import parse_json, read_json, read_toml
 from envs.types import Key, UserError, unknown
 
 __all__ = ["Gap", "changes", "each", "find", "from_dict", "load", "presets", "read_file", "title", "to_toml"]
-__all__ += ["worlds"]
+__all__ += ["usual", "worlds"]
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
 _KEYS = frozenset({"params", "effects", "scene", "families", "stratum"})
@@ -88,11 +88,20 @@ def find(task: str, source: str) -> Gap:
         if name not in content:
             raise UserError(unknown(f"gap in {path}", name, content))
         return content[name]
+    if "/" in source:
+        folder = "is a folder; name a gap, or a .toml or .json file"
+        raise UserError(f"{source}: {folder if Path(source).is_dir() else 'no such folder'}")
     if source in (known := presets(task)):
         return known[source]
     if known:
         raise UserError(f"{unknown(f'gap of {task}', source, [*known, SIM])}; or give a .toml or .json file")
     raise UserError(f"{task} has no gap {source!r}: it comes with none; give a .toml or .json file, or {SIM}")
+
+
+def usual(task: str) -> str:
+    """The gap to fine-tune a task on where nobody says which: `default`, else its first one, else SIM."""
+    known = presets(task)
+    return "default" if "default" in known else next(iter(known), SIM)
 
 
 def each(sources: Iterable[str]) -> tuple[str, ...]:

@@ -26,8 +26,9 @@ class DiagnoseArgs:
     """Folder of a prior of SAC, or of several (prior/seed-*); default: those that a run began with, else those of
     <out>/pretrain/<task>/<preset>."""
     real: str = "default"
-    """What happened: a folder of a fine-tuning run, or any other with rollouts in real/ (docs/formats.md). Or a gap by
-    name, a .toml/.json file, file.toml:name, or gymnasium:NAME, on which the policies then play zero-shot."""
+    """Where the policies play, zero-shot: a gap by name, a .toml/.json file, file.toml:name, gymnasium:NAME, or
+    remote[:HOST[:PORT]], a robot (docs/real-robot.md). Or what was recorded: a folder of a fine-tuning run, or any
+    other with rollouts in real/ (docs/formats.md)."""
     rollouts: int | None = None
     """Only the first so many recorded rollouts; default: all. On a gap: how many to play, default 4."""
     json: Json = False

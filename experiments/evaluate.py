@@ -13,9 +13,10 @@ from experiments.runner import cli, options
 from experiments.runner.cli import Json
 from experiments.runner.options import Impl, Out
 from experiments.runner.progress import doing
-from experiments.runner.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
+from experiments.runner.real_systems import ENOUGH, REMOTE, TOGETHER, advice, connect, described, is_robot, is_stepped
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder
+from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.presets import DEFAULT_PRESET
 
 _SEED = 2**31 + 2  # held out from training and from the choice of the prior
@@ -71,6 +72,8 @@ def main(args: EvaluateArgs) -> None:
             )
             if "video" in one:
                 print(f"    {one['video']}")
+        if "next" in system:
+            print(system["next"])
 
 
 def evaluate(args: EvaluateArgs) -> dict[str, Any]:
@@ -85,7 +88,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     from experiments.runner.pictures import film_episode
     from experiments.runner.recorded import RecordedSystem
     from experiments.runner.training import describe, play
-    from sgft_jax.algorithms import make_policy
+    from sgft_jax.algorithms import algorithm_of, make_policy
     from sgft_jax.io.priors import load_priors, observed_by
     from sgft_jax.io.real import RealStore
     from sgft_jax.stacking import member, part, stack
@@ -111,7 +114,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
         if is_robot(args.real[0]):  # what it does is kept
             store = RealStore(args.out / "evaluate" / env.name / REMOTE)
             system = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=1)
-        with doing(f"playing {args.episodes} episodes for each policy", 20, once=True):
+        with doing(f"playing {args.episodes} episodes for each policy", None if stepped else 20, once=not stepped):
             played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
     def results_of(i: int, k: int) -> dict[str, Any]:
@@ -123,12 +126,18 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
             results["video"] = film_episode(system.env, system.pools, i, member(episodes, 0), path)
         return results
 
+    fits = algorithm_of(card).name == get_method(DEFAULT).prior and not card.get("system")
+    advised = args.run is None and fits and env.score == "success" and args.episodes >= ENOUGH
     systems = []
     for i, gap in enumerate(reals):
         facts: dict[str, Any] = {"where": "in simulation" if gap is None else f"on the {gap.name} real system"}
         facts |= {"policies": [results_of(i, k) for k in range(len(priors))]}
         if stepped:
             facts["real_steps"] = int(part(played, i, len(priors)).valid.sum())
+        if advised and gap is not None:
+            chosen = {"task": task, "prior": args.prior or folders[0].parent, "set": args.set, "out": args.out}
+            succeeded = part(played, i, len(priors)).success
+            facts["next"] = advice(int((~succeeded).sum()), succeeded.size, args.real[i], **chosen)
         systems.append(facts)
     return {"task": env.name, "impl": env.impl, "episodes": args.episodes, "systems": systems}
 

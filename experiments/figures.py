@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from envs import extend
+from envs import extend, gaps
 from envs.types import UserError, unknown
-from experiments.runner import cli
+from experiments.runner import cli, options
 from sgft_jax.io.runs import check_folder
 
 if TYPE_CHECKING:
@@ -72,7 +72,9 @@ def _nothing(args: FiguresArgs, notes: list[str]) -> str:
     message = f"{args.out / 'finetune'}: holds no evaluated run to draw"
     if notes:
         return f"{message}: {notes[0]}" + (f"; and {len(notes) - 1} more" if len(notes) > 1 else "")
-    return f"{message}; make one with: python -m experiments.finetune --task {args.task or 'push'}"
+    task, real = args.task or "push", gaps.usual(extend.name_of(args.task or "push"))
+    made = options.command("finetune", task=task, real=None if real == "default" else real)
+    return f"{message}; make one with: {made}"
 
 
 def select(records: "Found", *, variants: bool = True, **wanted: Sequence[str]) -> "Found":

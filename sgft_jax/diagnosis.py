@@ -22,7 +22,7 @@ from sgft_jax.policies import sac_policy
 from sgft_jax.types import Task
 
 HORIZONS = (1, 2, 4, 8)  # steps ahead
-_SHARES = np.linspace(-0.5, 1.0, 61)  # of a command that may come from the step before
+SHARES = np.linspace(-0.5, 1.0, 61)  # of a command that may come from the step before
 _STILL = 0.25  # the share of steps that move an entry least
 _LARGEST, _KEPT_STD = 0.05, 0.871  # share of residuals left out there; std of a Gaussian without it
 
@@ -241,7 +241,7 @@ def lateness(
     def missed(share: Array) -> Array:
         return residuals(change, now._replace(action=now.action + share * (before - now.action)), nothing)
 
-    shares, best = jnp.asarray(_SHARES, jnp.float32), jnp.asarray(usual, jnp.float32)
+    shares, best = jnp.asarray(SHARES, jnp.float32), jnp.asarray(usual, jnp.float32)
     start = missed(best)
     for _ in range(2):  # the scale is that of the best share, and the other way round
         scale = jnp.maximum(robust_std(missed(best), held), spread)

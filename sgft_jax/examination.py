@@ -192,7 +192,11 @@ def describe(real: Look, simulated: Look, success: np.ndarray, *, turns: bool) -
             "nats": float(real.nats),
             "simulated": diagnosis.parts(simulated.known, turns=turns),
         },
-        "delay": {"share": float(real.late.share - simulated.late.share), "nats": float(real.late.nats)},
+        "delay": {
+            "share": float(real.late.share - simulated.late.share),
+            "nats": float(real.late.nats),
+            "at_limit": not diagnosis.SHARES[0] < float(real.late.share) < diagnosis.SHARES[-1],
+        },
         "noise": {"real": _noise(real), "simulated": _noise(simulated)},
     }
 

@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import re
+import shlex
 from pathlib import Path
 
 import h5py
@@ -16,7 +17,7 @@ import envs
 from envs import extend, gaps
 from envs.types import UserError
 from experiments import figures, finetune, hybrid, pretrain
-from experiments.runner import cli
+from experiments.runner import cli, finetune_args
 from sgft_jax import Batch, NetworkConfig, Prior, get_method
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io.priors import load_prior, save_prior
@@ -136,7 +137,10 @@ def test_commands_take_the_file(prior, tmp_path):
     with contextlib.redirect_stdout(said):
         pretrain.main(["--task", TASK, *options.split(), "--out", str(tmp_path)])
     assert (tmp_path / "pretrain/own_task/cpu/seed-0/prior/seed-0/prior.json").exists()
-    assert f"--task {TASK}" in said.getvalue()
+    (line,) = [line for line in said.getvalue().splitlines() if line.startswith("next: ")]
+    given = cli.parse(finetune_args.FinetuneArgs, "", shlex.split(line)[4:], default=finetune_args.arguments("guarded"))
+    assert given.task == TASK and given.real == ("sim",)  # it comes with no gap `default`
+    finetune_args.check(given)
 
 
 # --- a method -------------------------------------------------------------------------------------------------------

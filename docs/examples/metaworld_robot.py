@@ -119,7 +119,10 @@ def main() -> None:
     parser.add_argument("--into", type=Path, default=Path(), help="folder for the pictures")
     given = parser.parse_args()
     driver = Hammer(tuple(given.film), given.into)
-    print(robot_client.play(driver, given.url, token=given.token, name="meta-world"))
+    try:
+        print(robot_client.play(driver, given.url, token=given.token, name="meta-world"))
+    except robot_client.RefusedError as error:
+        parser.exit(2, f"error: the learner refuses this robot: {error}\n")
 
 
 if __name__ == "__main__":

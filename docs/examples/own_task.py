@@ -10,11 +10,12 @@ from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
 MARK, TOLERANCE, STEP = 0.3, 0.03, 0.08  # m: where the puck should stop, how exactly, pusher's way per step at |a| = 1
-MJCF = """
+MJCF = f"""
 <mujoco>
   <option timestep="0.01" integrator="implicitfast" gravity="0 0 0" iterations="4" ls_iterations="8"/>
   <default><geom type="sphere" size="0.02" contype="0" conaffinity="0"/></default>
   <worldbody>
+    <site name="mark" type="cylinder" pos="{MARK} 0 -0.02" size="{TOLERANCE} 0.001" rgba="0.2 0.7 0.3 1"/>
     <body><joint name="pusher" type="slide" axis="1 0 0" damping="1"/><geom name="tip" mass="0.2"/></body>
     <body><joint name="puck" type="slide" axis="1 0 0" frictionloss="0.1"/><geom name="disc" mass="0.1"/></body>
   </worldbody>

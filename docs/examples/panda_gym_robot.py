@@ -82,7 +82,10 @@ def main() -> None:
     parser.add_argument("--into", type=Path, default=Path(), help="folder for the pictures")
     given = parser.parse_args()
     driver = PandaPush(tuple(given.film), given.into)
-    print(robot_client.play(driver, given.url, token=given.token, name="panda-gym"))
+    try:
+        print(robot_client.play(driver, given.url, token=given.token, name="panda-gym"))
+    except robot_client.RefusedError as error:
+        parser.exit(2, f"error: the learner refuses this robot: {error}\n")
 
 
 if __name__ == "__main__":

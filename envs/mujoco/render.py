@@ -16,6 +16,7 @@ from envs.types import UserError
 FPS = 10  # in real time; a graphics library without a graphics card needs 0.1 s a frame
 SIZE = 360, 480  # height, width in pixels
 CAPTION = 52  # pixels, height of the strip above a captioned video
+LEAST = 0.3  # of the camera's distance: what a scene extends over at least
 JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, and nothing to draw in between
 SUPERSAMPLING = 2  # drawn so many times larger, then averaged: smooth edges on every backend
 TILE, TILES = 0.75, 16  # m, of a tile of the floor; how many there are along each side
@@ -75,6 +76,8 @@ def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np
     values = theta.values() if isinstance(theta, Mapping) else theta
     by_name = dict(zip([p.name for p in scene.parameters], map(float, values), strict=True))
     model = dressed(scene, by_name).compile()
+    # What is drawn begins and ends at multiples of the extent, which MuJoCo takes from the scene at rest.
+    model.stat.extent = max(model.stat.extent, LEAST * (scene.view.distance if scene.view else 1.0))
     data = mujoco.MjData(model)
     camera = _camera(model, scene.view)
     renderer = _renderer(model)

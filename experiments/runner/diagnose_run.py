@@ -17,7 +17,7 @@ from envs.types import Transition, UserError
 from experiments.runner.cli import columns
 from experiments.runner.gaps_run import systems
 from experiments.runner.progress import doing
-from experiments.runner.real_systems import connect, is_robot, is_stepped, title
+from experiments.runner.real_systems import REMOTE, advice, connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
 from experiments.runner.training import play
 from sgft_jax import api, stacking
@@ -33,6 +33,7 @@ from sgft_jax.io.real import RealStore
 from sgft_jax.io.runs import read_config
 from sgft_jax.math import stats
 from sgft_jax.methods import get_method
+from sgft_jax.models.distortion import FURTHEST
 from sgft_jax.types import Prior
 
 if TYPE_CHECKING:
@@ -84,7 +85,12 @@ def diagnose(
     picture = figures.diagnosis(home / "diagnosis.png", mean[-1], signs, _points(examined), title=header)
     write_json(home / "diagnosis.json", findings)
     lines = [header, *_lines(labels, examined, mean[-1]), "", *findings["verdict"], ""]
-    return jsonable(findings), [*lines, f"picture: {picture}", f"numbers: {home / 'diagnosis.json'}"]
+    lines += [f"picture: {picture}", f"numbers: {home / 'diagnosis.json'}"]
+    if env.score == "success" and not (recorded and read_config(recorded)):  # in a run others have played, too
+        n, real = mean[-1]["rollouts"], REMOTE if recorded else args.real
+        chosen = {"task": task, "prior": args.prior or folders[0].parent, "out": args.out}
+        lines.append(advice(n - round(n * mean[-1]["success"]), n, real, **chosen))
+    return jsonable(findings), lines
 
 
 def _examine(
@@ -117,7 +123,7 @@ def names_of(env: Env) -> Names:
     """What people call the numbers of a task."""
     action, sensors = ([label for e in entries for label in _labels(e)] for entries in (env.action, env.measured))
     units = [e.unit for e in env.measured for _ in range(e.size)]
-    return Names(action, list(zip(sensors, units, strict=True)), env.sensor_errors, env.control_dt)
+    return Names(action, list(zip(sensors, units, strict=True)), env.sensor_errors, env.control_dt, FURTHEST)
 
 
 def _labels(entry: Entry) -> list[str]:
@@ -176,7 +182,8 @@ def _play_real(env: Env, args: "DiagnoseArgs", priors: list[Prior], n: int, home
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
         members = stacking.stack([prior.params for prior in priors])
         kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
-        played = play(kept, make_policy(priors[0].card, env), members, key, n, explore=True)
+        with doing(f"playing {_rollouts(n)} of each prior"):
+            played = play(kept, make_policy(priors[0].card, env), members, key, n, explore=True)
     finally:
         system.close()
     return _of_members(played, len(priors))

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs import mesh
+from envs import extend, mesh
 from envs.base import Env
 from envs.gaps import Gap
 from envs.rollout import Episode
 from envs.types import Key, PyTree
-from experiments.runner import cli, real_systems
+from experiments.runner import cli, options, real_systems
 from experiments.runner.ahead import Ahead, compiling
 from experiments.runner.kept import kept_in, simulated_rows
 from experiments.runner.machines import reserve
@@ -98,7 +98,8 @@ def run(
             which = finetuning.prior_of(setup.priors, setup.seeds)
             learner = LearnerProcess(again, setup.seeds, which, setup.simulated)
             last.callback(learner.close)
-            learner.wait()
+            with doing("starting the process that learns", 20):
+                learner.wait()
         return _Run(args, setup, card, records, logs).work(learner)
 
 
@@ -192,6 +193,9 @@ class FinetuneRecord(Record):
         write_summary(self.folder, summary)
         if curve is not None:
             self._show(curve, best.get("score"))
+        elif env.score == "success":
+            succeeded = np.concatenate([self.real.rollout(i)["success"] for i in range(len(self.real))])
+            print(f"{self.gap.name}: {succeeded.sum()} of {len(succeeded)} training rollouts have succeeded")
         return summary
 
     def _show(self, curve: Curve, best: np.ndarray | None) -> None:
@@ -329,7 +333,8 @@ class _Run(Training):
         if not self.done(before) and isinstance(self.system, _Awaited):
             return doing("playing the first rollout", 10, once=True)
         if not self.done(before):
-            return doing("playing the first rollout and compiling what learns from it", 60, once=True)
+            usual = {} if self.sync_every else {"about": 60, "once": True}  # of a robot nobody knows
+            return doing("playing the first rollout and compiling what learns from it", **usual)
         return doing("playing and learning")
 
     def log(self, state: FinetuneProgress, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
@@ -391,9 +396,18 @@ class _Run(Training):
                 path = record.folder / "videos" / f"seed-{record.seeds[0]}.mp4"
                 play = functools.partial(lambda first: [member(x, first) for x in films()], i * self.count)
                 print(before_and_after(record.env, pool, play, path, rollouts=rollouts))
-            print(f"results: {record.folder}  (policy/, best/, real/, summary.json, figures/)")
-        print(cli.as_typed(f"next: python -m experiments.figures --out {self.args.out}"))
+            files = ("policy/", "best/", "real/", "summary.json", "figures/")
+            print(f"results: {record.folder}  ({', '.join(x for x in files if (record.folder / x).exists())})")
+        print(cli.as_typed(f"next: {self._next()}"))
         return summaries
+
+    def _next(self) -> str:
+        """The command that shows what has come of the run."""
+        args = self.args
+        if self.episodes:
+            return options.command("figures", out=args.out)
+        run = {"run": self.records[0].folder, "best": True, "task": args.task if extend.is_source(args.task) else None}
+        return options.command("evaluate", **run, real=args.real[0], set=args.set, episodes=10, out=args.out)
 
     def _before_and_after(self, progress: FinetuneProgress) -> list[Episode]:
         """The evaluation episodes [M, n] of the policy before the first real rollout and of the agent as it is now."""

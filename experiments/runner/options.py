@@ -3,6 +3,7 @@
 Imports neither JAX nor MuJoCo.
 """
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,6 +12,7 @@ from tyro.conf import arg
 
 import envs
 from envs import extend, gaps
+from envs.base import Effects, misnamed
 from envs.types import UserError, unknown
 from sgft_jax import checks, types
 from sgft_jax.files.disk import ASIDE, present
@@ -62,6 +64,16 @@ def seed_list(first: int, count: int) -> list[int]:
 def seeds_name(seeds: Sequence[int]) -> str:
     """The folder of a run with these seeds: `seed-3`, or `seeds-0-9`."""
     return f"seed-{seeds[0]}" if len(seeds) == 1 else f"seeds-{seeds[0]}-{seeds[-1]}"
+
+
+def command(name: str, **given: Any) -> str:
+    """A command of ours as a user types it, without options that are None, empty, or --out by default."""
+    words = ["python", "-m", f"experiments.{name}"]
+    for option, value in given.items():
+        if value and (option, value) != ("out", Path("runs")):
+            values = () if value is True else value if isinstance(value, tuple) else (value,)
+            words += [f"--{option}", *map(str, values)]
+    return shlex.join(words)
 
 
 def without_repeats(option: str, words: Sequence[str]) -> None:
@@ -122,11 +134,17 @@ def check_folders(option: str, words: Sequence[str], folders: Sequence[Path], ar
 
 
 def check_task(task: str, reals: Sequence[str] = (), changes: Sequence[str] = ()) -> None:
-    """Raise UserError where there is no such task, or no such real system of it, or for changes that set nothing."""
+    """Raise UserError where there is no such task, or no such real system of it, or for changes that set nothing.
+
+    Only names that are no effects take the import of the task to check.
+    """
     name = envs.name_of(task)
-    for real in reals:
-        gaps.find(name, real)
-    gaps.changes(changes)
+    chosen, known = [gaps.find(name, real) for real in reals], gaps.presets(name)
+    named = {x for gap in chosen if known.get(gap.name) != gap for x in (*gap.params, *gap.effects)}
+    if odd := [x for x in (*gaps.changes(changes), *sorted(named)) if x not in Effects._fields]:
+        scene = envs.scene(name)
+        if scene and (strange := [x for x in odd if x not in [p.name for p in scene.parameters]]):
+            raise misnamed(scene, strange[0])
 
 
 def at_least_one(args: object, *names: str) -> None:

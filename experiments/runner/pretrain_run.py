@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs import mesh
+from envs import gaps, mesh
 from envs.base import Env, World
 from envs.domains import with_actuators
 from envs.gaps import SIM, Gap
@@ -24,6 +24,7 @@ from envs.types import PyTree
 from experiments.runner.ahead import Ahead, compiling
 from experiments.runner.cli import as_typed
 from experiments.runner.machines import folder_of_host, join_hosts, reserve
+from experiments.runner.options import command
 from experiments.runner.pictures import film_episode
 from experiments.runner.progress import doing
 from experiments.runner.report import Report, make_report, numbers
@@ -328,7 +329,7 @@ class _Run(Training):
         methods = [name for name, way in all_methods().items() if (way.prior, way.sees_system) == wanted]
         if not methods:  # as for an algorithm that is new
             return
-        method = "" if methods[0] == DEFAULT else f" --method {methods[0]}"
-        method += "" if self.gap is None else f" --real {SIM}"
-        out = "" if self.args.out == type(self.args).out else f" --out {self.args.out}"
-        print(as_typed(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {folder}{out}"))
+        method = None if methods[0] == DEFAULT else methods[0]
+        real = gaps.usual(self.env.name) if self.gap is None else SIM
+        chosen = {"method": method, "real": None if real == "default" else real, "prior": folder, "out": self.args.out}
+        print(as_typed(f"next: {command('finetune', task=self.args.task, **chosen)}"))

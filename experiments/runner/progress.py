@@ -103,6 +103,13 @@ def doing(words: str, about: float | None = None, *, once: bool = False) -> Iter
     usual = [] if about is None else [f"about {about:.0f} s" if about < 100 else f"about {about / 60:.0f} min"]
     _VOICE.listen()
     _VOICE.announce(words, ", ".join([*usual, "once"] if once else usual))
+    with amid(words):
+        yield
+
+
+@contextlib.contextmanager
+def amid(words: str) -> Iterator[None]:
+    """Says what goes on in the `with` block where that lasts, and nothing when it begins."""
     _VOICE.phases.append(_Phase(words, time.monotonic()))
     try:
         yield

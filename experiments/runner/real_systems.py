@@ -21,8 +21,9 @@ from envs import extend, gaps
 from envs.files import read_text
 from envs.gaps import Gap
 from envs.types import UserError
-from experiments.runner import cli
+from experiments.runner import cli, options
 from experiments.runner.options import check_task, port_of
+from experiments.runner.progress import amid
 from sgft_jax.systems.door import bound, check_host
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 TOGETHER = "a robot, Gymnasium environments and simulations cannot be played together; run them one after another"
 GYMNASIUM = "gymnasium:"  # then a name for `gymnasium.make`, which may begin with the module that registers it
 REMOTE = "remote"  # then perhaps where to listen, as `remote:HOST:PORT`
+ENOUGH = 10  # rollouts that choose a method
 _HOST, _PORT = "127.0.0.1", 8765
 _TOKEN = "robot-token"
 _LETTERS = re.compile(r"[!-~]{16,256}")  # of a token: so many cannot be guessed
@@ -141,15 +143,15 @@ def token(home: Path) -> str:
 
 def keywords(changes: Sequence[str]) -> dict[str, Any]:
     """What `--set` passes to `gymnasium.make`: JSON where it reads as such, else text; UserError for no name=value."""
-    options: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for text in changes:
         name, equals, value = (part.strip() for part in text.partition("="))
-        if not equals or not name.isidentifier() or name in options:
+        if not equals or not name.isidentifier() or name in values:
             raise UserError(f"--set '{text}': write name=value, each name once")
-        options[name] = value
+        values[name] = value
         with contextlib.suppress(ValueError):
-            options[name] = json.loads(value)
-    return options
+            values[name] = json.loads(value)
+    return values
 
 
 def described(env: Env, real: str, changes: Sequence[str]) -> Gap:
@@ -157,6 +159,15 @@ def described(env: Env, real: str, changes: Sequence[str]) -> Gap:
     if not is_stepped(real):
         return gaps.load(env, real, changes)
     return Gap(REMOTE if is_robot(real) else "+".join([real, *changes]), {}, {})
+
+
+def advice(failed: int, count: int, real: str, **chosen: Any) -> str:
+    """Which method suits a policy that has failed so often (docs/diagnose.md), as a command. chosen: its options."""
+    from sgft_jax.analysis.verdict import choice
+
+    more, seeds = "" if count >= ENOUGH else f", {ENOUGH} say more", 1 if is_robot(real) else None
+    command = options.command("finetune", **chosen, real=real, seeds=seeds, method=choice(failed, count))
+    return cli.as_typed(f"{failed} of {count} failed{more}: next: {command}")
 
 
 def connect(
@@ -176,7 +187,7 @@ def connect(
             raise UserError(f"--real {reals[0]}: one robot plays for {members}; choose one policy, or --seeds 1")
         host, port = address(reals[0])
         door: dict[str, Any] = {"host": host, "port": port, "token": token(home), "token_in": str(home / _TOKEN)}
-        times = {"period": env.control_dt, "steps": env.episode_length}
+        times = {"period": env.control_dt, "steps": env.episode_length, "waits": lambda: amid("waiting for a robot")}
         return Gymnasium(env, Remote(env.measured_dim, env.act_dim, **times, **door), gamma=gamma)
     import gymnasium
 

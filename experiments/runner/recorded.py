@@ -12,6 +12,7 @@ import numpy as np
 from envs.base import Env
 from envs.rollout import Episode
 from envs.types import Key, PyTree, Transition, UserError
+from experiments.runner.progress import amid
 from sgft_jax.datasets import logs as datasets
 from sgft_jax.datasets.logs import Log
 from sgft_jax.io.real import RealStore
@@ -56,7 +57,11 @@ class RecordedSystem:
         """Episodes [M, n], stored one after another."""
         if explore != self.explore:
             return self.inner.play(policy, states, keys, explore=explore)
-        played = [self._one(policy, states, keys[:, i : i + 1]) for i in range(keys.shape[1])]
+        played, n = [], keys.shape[1]
+        for i in range(n):
+            which = f"episode {i + 1} of {n}" if n > 1 else f"rollout {self.rollout + 1}"
+            with amid(f"playing {which} on the robot") if self.sync_every else contextlib.nullcontext():
+                played.append(self._one(policy, states, keys[:, i : i + 1]))
         return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *played)
 
     def _one(self, policy: Any, states: PyTree, keys: Key) -> Episode:

@@ -15,6 +15,7 @@ _SCALE, _ROTATION, _BIAS = 0.15, 0.1, 0.08  # share, rad, share of the range of 
 _ERROR = 0.3  # of the std of a sensor's error
 _DELAY = 0.15  # of a control period
 _NOISE = 2.0  # times that in simulation
+_NEAR, _LIMIT = 0.98, " or more (the limit of the fit)"  # share of the furthest that a fit believes in
 _MODELS = 1.5  # times the error in simulation
 _IMPROVABLE = 0.9  # of visited states, for a horizon that suffices
 _SOLVED, _WORTH = 0.95, 0.05  # success from which on fine-tuning has little to gain, and gain that is worth it
@@ -88,18 +89,24 @@ def rollouts_until(x: Inputs, level: float = LEVEL, c: Coefficients = COEFFICIEN
     return int(reached[0]) if reached.size else None
 
 
+def choice(failed: int, rollouts: int) -> str:
+    """The method for a policy that has failed so often: three or more of ten call for a guard (docs/diagnose.md)."""
+    return "guarded" if 10 * failed >= 3 * rollouts else "sac"
+
+
 # --- in words ---------------------------------------------------------------------------------------------------------
 
 
 class Names(NamedTuple):
     """Of a task's numbers, for people. action: [act_dim]. sensors: [measured_dim] (name, unit). errors: [measured_dim]
-    std of constant sensor errors. dt: s, control period.
+    std of constant sensor errors. dt: s, control period. furthest: std of an error that a fit believes in at most.
     """
 
     action: Sequence[str]
     sensors: Sequence[tuple[str, str]]
     errors: Sequence[float]
     dt: float
+    furthest: float = math.inf
 
 
 class Sign(NamedTuple):
@@ -121,7 +128,8 @@ def signs(diagnosis: Mapping[str, Any], names: Names) -> list[Sign]:
     scales, biases = (dict(zip(names.action, known[key], strict=True)) for key in ("scale", "bias"))
     scale, bias = max(abs(math.log(x)) for x in scales.values()), max(map(abs, biases.values()))
     far, off, turned, share = _each(scales, "{:.2f}"), _each(biases, "{:+.2f}"), known["rotation"], late["share"]
-    comes = f"{abs(share) * names.dt:.3f} s {'later' if share > 0 else 'earlier'}"
+    limit, side = _LIMIT if late.get("at_limit") == 1 else "", "later" if share > 0 else "earlier"
+    comes = f"{abs(share) * names.dt:.3f} s{limit} {side}"
     rest = (
         f"with all that identified, the models err {times:.1f} times as much as in simulation four steps ahead: "
         "something else differs, such as masses, friction, contacts or noise"
@@ -132,7 +140,7 @@ def signs(diagnosis: Mapping[str, Any], names: Names) -> list[Sign]:
         ),
         Sign("command rotation", sure * abs(turned) / _ROTATION, f"commands are turned by {turned:+.2f} rad"),
         Sign("command bias", sure * bias / _BIAS, f"commands are off by {off} of their range"),
-        _sensor_error(known["sensor_errors"], names),
+        _sensor_error(known["sensor_errors"], diagnosis["identified"]["sensor_errors"], names),
         Sign(
             "delay", min(late["nats"] / _NATS, 1.0) * abs(share) / _DELAY, f"commands come {comes} than in simulation"
         ),
@@ -159,11 +167,12 @@ def _beyond_simulation(identified: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _sensor_error(offsets: Sequence[float], names: Names) -> Sign:
+def _sensor_error(offsets: Sequence[float], fitted: Sequence[float], names: Names) -> Sign:
+    """offsets: beyond what the same fit finds in simulation."""
     sizes = [(abs(x) / std if std else 0.0) for x, std in zip(offsets, names.errors, strict=True)]
     wrong = [
-        f"{name} by {_measure(x, unit)}"
-        for size, x, (name, unit) in zip(sizes, offsets, names.sensors, strict=True)
+        f"{name} by {_measure(x, unit)}" + _LIMIT * (abs(raw) >= _NEAR * names.furthest * std)
+        for size, x, raw, std, (name, unit) in zip(sizes, offsets, fitted, names.errors, names.sensors, strict=True)
         if size >= _ERROR
     ]
     return Sign("sensor error", max(sizes, default=0.0) / _ERROR, f"sensors are off: {', '.join(wrong)}")
@@ -220,7 +229,8 @@ def _guide(value: Mapping[str, Any]) -> str:
 def _worth(success: float, x: Inputs, c: Coefficients) -> str:
     """success: share of the rollouts, without the doubt that `inputs_of` adds."""
     points, after = 100 * gain(x, c), 100 * success_after(x, AHEAD, c)
-    words = f"{points:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
+    before = f"from about {100 * x.success:.0f}"  # what failed in a few rollouts may succeed in the next ones
+    words = f"{points:+.0f} points expected in {AHEAD} rollouts, {before} to {after:.0f} %"
     if success >= _SOLVED:
         return f"fine-tuning: little to gain ({points:+.0f} points expected); keep the policy, or use sac"
     if points >= 100 * _WORTH:
@@ -237,7 +247,7 @@ def _horizon(diagnosis: Mapping[str, Any]) -> str:
     best = max(range(len(shares)), key=shares.__getitem__)
     return (
         f"horizon of SGFT: H = {diagnosis['horizons'][best]}, with which {100 * shares[best]:.0f} % of the states are "
-        "improvable; no horizon up to 8 suffices, so methods without V_sim (guarded, sac, mbpo) may do better"
+        "improvable; no horizon up to 8 suffices, so methods without V_sim, such as guarded and sac, may do better"
     )
 
 

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from envs.files import Schema, read_object
 from envs.types import UserError
-from sgft_jax.files.disk import ASIDE, Lock, differences, empty, write_json
+from sgft_jax.files.disk import ASIDE, InUseError, Lock, differences, empty, in_use, write_json
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
 ROOT = Path(__file__).parents[2]  # of the repository, in a checkout
@@ -183,6 +183,8 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
         stored = _stored(folder) if (folder / CONFIG).exists() else {}
         if _MARK not in stored:
             raise UserError(f"{folder}: is not a run folder (it has no {CONFIG} of ours); choose another one")
+        if in_use(folder):
+            raise InUseError(f"{folder}: another process is writing to it")
         if not (resume or overwrite) and _has_results(folder):
             raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
     elif resume and not folder.exists():

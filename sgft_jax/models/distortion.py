@@ -20,7 +20,7 @@ from sgft_jax.models.robust import most_probable, spread_of
 from sgft_jax.types import Batch, Normalizer, SimulatedData, Task
 
 _TURN, _SCALE, _BIAS = 0.6, 0.4, 0.2  # std of the rotation (rad), log-scales and biases before any data
-_FURTHEST = 2.0  # std of a sensor's error
+FURTHEST = 2.0  # std of a sensor's error
 _EARNED, _TIMES = 20.0, 1.5  # nats of evidence that errors of sensors must add to the commands', and times
 _STARTS = (-1.4, -0.7, 0.0, 0.7, 1.4)  # rad; from elsewhere the search may end in another turn
 
@@ -128,7 +128,7 @@ def _fit(
     wrong = np.flatnonzero(errors)  # sensors that may be; their offsets count in units of the error
     n = 1 + 2 * act_dim
     belief = jnp.array([_TURN if turns else 1e-4, *[_SCALE] * act_dim, *[_BIAS] * act_dim, *[1.0] * len(wrong)])
-    bound = jnp.array([*[jnp.inf] * n, *[_FURTHEST] * len(wrong)])
+    bound = jnp.array([*[jnp.inf] * n, *[FURTHEST] * len(wrong)])
 
     def described(p: Array) -> Distortion:
         offset = jnp.zeros(len(errors)).at[wrong].set(p[n:] * np.array(errors)[wrong])

@@ -93,7 +93,7 @@ class Remote:
     an episode by itself, so that it does not go on when messages are lost. host: interface to listen at, default this
     computer alone. port: 0 chooses a free one. token: what the robot must know, default a fresh one. token_in: where
     people find it, because it is never printed. again: seconds after which an unanswered message is repeated. say:
-    hears one line about everything unusual.
+    hears one line about everything unusual. waits() -> what is entered while there is no robot.
     Raises UserError where one cannot listen there, and for sizes and times that cannot be.
     """
 
@@ -110,6 +110,7 @@ class Remote:
         token_in: str = "the attribute `token`",
         again: float = 1.0,
         say: Callable[[str], None] = print,
+        waits: Callable[[], contextlib.AbstractContextManager[None]] = contextlib.nullcontext,
     ) -> None:
         if not (obs_size > 0 < action_size and 0 < again < math.inf and (steps is None or steps > 0)):
             raise UserError("Remote: sizes, steps and `again` must be more than 0")
@@ -117,6 +118,7 @@ class Remote:
             raise UserError(f"Remote: a step cannot take {period} seconds")
         self._period, self._steps = period, steps
         self.obs_size, self.action_size, self.token = obs_size, action_size, token or secrets.token_hex(16)
+        self._waits = waits
         self._again, self._say, self._token_in = again, lambda line: say(printable(line, _LINE)), token_in
         self._refused, self._ignored = _Seldom(self._say), _Seldom(self._say)
         self._lock, self._connected = threading.Lock(), threading.Event()
@@ -186,7 +188,8 @@ class Remote:
         """The link to a robot, once there is one."""
         while not self._connected.is_set() or (link := self._link) is None:
             self._say(f"waiting for a robot at {self.url}; its token is in {self._token_in}")
-            self._connected.wait()
+            with self._waits():
+                self._connected.wait()
         return link
 
     def _ask[T: (Began, Moved, Rested)](self, message: bytes, kind: type[T], tries: int | None = None) -> T | None:

@@ -78,6 +78,10 @@ def test_recordings_of_one_policy_are_looked_at_by_every_prior(priors, tmp_path,
     assert successes("--real", recorded) == (f"4 rollouts recorded in {recorded}", [every] * 2)
     data, found = successes("--real", recorded / "real", "--rollouts", 2)
     assert data == f"2 rollouts recorded in {recorded}" and found == [every[:2]] * 2
+    call("--prior", priors, "--out", tmp_path / "runs", "--real", recorded)
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("2 of 4 failed, 10 say more: next: python -m experiments.finetune --task toy --prior ")
+    assert last.endswith("--real remote --seeds 1 --method guarded")
 
 
 def run(out, real, success, priors, **settings):
@@ -129,6 +133,7 @@ def test_calibration_and_its_check_on_other_runs(priors, tmp_path, capsys):
         (["--task", "toy", "--prior", "PRIOR", "--real", "strange"], "toy has no gap 'strange'"),
         (["--prior", "PRIOR", "--real", "sim", "--rollouts", "0"], "must be at least 1"),
         (["--prior", "PRIOR", "--real", "EMPTY"], "holds no recorded rollouts"),
+        (["--prior", "PRIOR", "--real", "runs/nothing"], "runs/nothing: no such folder"),
         (
             ["--prior", "PRIOR", "--real", "wide"],
             "obs has shape [1, 20, 5], these priors of toy need [seeds, steps, 4]",

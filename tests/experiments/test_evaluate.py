@@ -106,6 +106,9 @@ def test_lines_for_people(run, capsys):
     head, *lines = capsys.readouterr().out.splitlines()
     assert head == "toy, on the slow real system, 20 episodes for each policy:"
     assert len(lines) == 2 and all(re.search(r"seed-\d: success \d+\.\d % \[.*\], return -?\d", line) for line in lines)
+    call("--prior", run / "policy", "--episodes", 10, "--real", run / "slow.toml")
+    advice = capsys.readouterr().out.splitlines()[-1]
+    assert re.match(rf"\d+ of 20 failed: next: python -m experiments.finetune --task toy --prior {run}/policy ", advice)
 
 
 @pytest.mark.heavy

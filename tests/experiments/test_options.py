@@ -9,7 +9,7 @@ from priors_by_hand import save_prior
 from envs.types import UserError
 from experiments.runner import machines, options
 from experiments.runner.machines import reserve
-from experiments.runner.options import prior_folders, seed_list, seeds_name
+from experiments.runner.options import check_task, command, prior_folders, seed_list, seeds_name
 from sgft_jax.io.cards import resolve_shipped
 
 
@@ -93,6 +93,25 @@ def test_advice_where_there_is_no_prior_fits_what_was_asked(tmp_path):
         prior_folders(tmp_path / "nowhere", out=tmp_path, task="toy", preset="cpu")
     with pytest.raises(UserError, match=r"--prior .*: holds no prior$"):
         prior_folders(tmp_path, out=tmp_path, task="toy", preset="cpu")
+
+
+def test_a_command_is_what_a_user_types():
+    given = {"task": "my task.py", "best": True, "set": ("mass=1", "scale=[1,2]"), "real": None, "out": Path("runs")}
+    wanted = "python -m experiments.evaluate --task 'my task.py' --best --set mass=1 'scale=[1,2]'"
+    assert command("evaluate", **given) == wanted and command("figures", out="else").endswith(" --out else")
+
+
+def test_what_no_real_system_has_is_found_before_anything_is_compiled(tmp_path):
+    check_task("push", ["default"], ["latency=0.05", "object_mass=0.1"])
+    (tmp_path / "odd.toml").write_text("[params]\nobject_mas = 0.1\n")
+    for reals, changes, words in (
+        ([], ["latencyy=0.05"], "did you mean 'latency'"),
+        ([f"{tmp_path}/odd.toml"], [], "did you mean 'object_mass'"),
+        (["runs/nothing"], [], "runs/nothing: no such folder"),
+        ([str(tmp_path)], [], "is a folder; name a gap"),
+    ):
+        with pytest.raises(UserError, match=words):
+            check_task("push", reals, changes)
 
 
 def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):

@@ -96,6 +96,14 @@ def test_a_phase_is_announced_once_with_the_time_that_it_takes(capsys):
     ]
 
 
+def test_what_goes_on_within_a_phase_is_said_where_it_lasts(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "_AGAIN", 0.2)
+    with never_silent(), doing("playing"), progress.amid("waiting for a robot"):
+        time.sleep(1.2)
+    first, *others = lines(capsys)
+    assert first == "playing" and others and all("waiting for a robot" in line for line in others)
+
+
 def test_who_works_for_long_says_at_what_and_whether_it_compiles(monkeypatch, capsys):
     """One second of compiling and one of other work, with patience of 0.2 s: words come in each."""
     for name in ("_AGAIN", "_SELDOM"):
@@ -163,6 +171,7 @@ def test_the_phases_of_every_command():
         "export": {"exporting to ... and comparing actions"},
         "finetune_run": {
             "making the real systems",
+            "starting the process that learns",
             "preparing the agents",
             "learning from simulated transitions",
             "playing the first rollout",

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import stat
@@ -397,9 +398,14 @@ def test_runs_that_begin_together_agree_on_a_token(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_robot_is_fine_tuned_and_costs_no_evaluation(robot, port, tmp_path):
+def test_a_robot_is_fine_tuned_and_costs_no_evaluation(robot, port, tmp_path, capsys):
     driver = robot(port)
     folder = run(tmp_path, port)
+    *_, succeeded, results, following = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"remote: \d of 3 training rollouts have succeeded", succeeded)
+    assert results == f"results: {folder}  (policy/, best/, real/, summary.json)"
+    wanted = f"--run {folder} --best --real remote::{port} --episodes 10 --out {tmp_path / 'runs'}"
+    assert following == f"next: python -m experiments.evaluate {wanted}"
     assert driver.steps == 3 * T and len(driver.starts) == len(set(driver.starts)) == 3
     names = sorted(path.name for path in (folder / "real").iterdir())
     assert names == [f"rollout-00000{i}.npz" for i in range(3)]

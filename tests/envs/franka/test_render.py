@@ -1,6 +1,7 @@
 """Pictures: frames between control steps, and real files where MuJoCo can render."""
 
 import subprocess
+from pathlib import Path
 
 import imageio_ffmpeg
 import jax
@@ -9,11 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from envs import extend
 from envs.franka import hammer, insert, push
 from envs.mujoco import render
 from envs.types import UserError
 from experiments.runner.pictures import select_renderer
 
+ROOT = Path(__file__).parents[3]
 SCENES = {"push": push.SCENE, "hammer": hammer.SCENE, "insert": insert.SCENE}
 
 
@@ -71,6 +74,26 @@ def test_a_driven_nail_is_seen(thickness):
     (dome,) = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID)
     board = theta["nail_z"] - 2 * theta["nail_half_height"]
     assert 0.005 < data.geom_xpos[dome, 2] + model.geom_size[dome, 2] - board < 0.01
+
+
+@pytest.mark.heavy
+def test_a_tiny_scene_is_seen(renderer):
+    """Two small balls at one place, and far from where they were: MuJoCo draws to 20 times the extent."""
+    task = extend.load("task", str(ROOT / "docs/examples/own_task.py"), "make").SCENE
+
+    def unmarked(theta):
+        spec = task.build(theta)
+        spec.delete(spec.site("mark"))
+        return spec
+
+    def image(scene):
+        (frame,) = render._frames(scene, nominal(scene), still(scene, 0))
+        return frame.astype(int)
+
+    for scene, marked in ((task, True), (task._replace(build=unmarked), False)):
+        r, g, b = np.moveaxis(image(scene), -1, 0)
+        assert ((g > np.maximum(r, b) + 20).sum() > 100) == marked
+        assert (abs(r - b) < 3).sum() > 100  # grey balls before a blue sky
 
 
 @pytest.mark.heavy

@@ -8,7 +8,11 @@ from sgft_jax.analysis import figures, verdict
 from sgft_jax.analysis.verdict import Coefficients, Names
 
 NAMES = Names(
-    action=["x", "y"], sensors=[("hand", "m"), ("puck", "m"), ("angle", "rad")], errors=(0.0, 0.01, 0.0), dt=0.2
+    action=["x", "y"],
+    sensors=[("hand", "m"), ("puck", "m"), ("angle", "rad")],
+    errors=(0.0, 0.01, 0.0),
+    dt=0.2,
+    furthest=2.0,
 )
 C = Coefficients(base=0.0, improvable=0.5, explained=0.5, pace=3.0)
 NOTHING = {
@@ -61,6 +65,8 @@ def counted(**changes):
         ({"identified__rotation": -0.3}, "command rotation", "-0.30 rad"),
         ({"identified__bias": [0.0, 0.2]}, "command bias", "+0.00 (x), +0.20 (y)"),
         ({"identified__sensor_errors": [0.0, -0.012, 0.0]}, "sensor error", "puck by -12.0 mm"),
+        ({"identified__sensor_errors": [0.0, 0.02, 0.0]}, "sensor error", "+20.0 mm or more (the limit of the fit)"),
+        ({"delay": {"share": 1.0, "nats": 90.0, "at_limit": True}}, "delay", "0.200 s or more (the limit of the fit)"),
         ({"delay": {"share": 0.5, "nats": 90.0}}, "delay", "0.100 s later than in simulation"),
         ({"delay": {"share": -0.5, "nats": 90.0}}, "delay", "0.100 s earlier"),
         ({"noise__real": [0.001, 0.001, 0.03]}, "noise", "angle is 0.03 rad, 0.01 rad in simulation"),
@@ -98,12 +104,18 @@ def test_what_is_worth_it():
     assert horizon == "horizon of SGFT: H = 1 is enough, 100 % of the states are improvable with it"
     failed, _, later = words(success=0.0, model_error__identified=[0.01] * 4)
     assert failed.startswith("fine-tuning: worth it, +") and "expected after" in later
+    assert "points expected in 20 rollouts, from about 20 to" in failed  # (0 of 4 + what V_sim promises) / 5
     hopeless = {"value__real": [{"improvable": 0.0, "improving": 0.0}] * 4, "model_error__identified": [9.0] * 4}
     lost, horizon, never = words(success=0.0, **hopeless)
     assert "little hope" in lost and never == "time: 90 % are not expected within 20 rollouts"
     assert "no horizon up to 8 suffices" in horizon
     far = [{"improvable": share, "improving": 0.0} for share in (0.5, 0.6, 0.95, 1.0)]
     assert "H = 4 is enough, 95 %" in words(value__real=far)[1]
+
+
+def test_three_failures_of_ten_call_for_a_guard():
+    chosen = [verdict.choice(*counts) for counts in ((2, 10), (3, 10), (1, 4), (2, 4))]
+    assert chosen == ["sac", "guarded", "sac", "guarded"]
 
 
 @pytest.mark.heavy

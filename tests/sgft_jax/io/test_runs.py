@@ -236,6 +236,8 @@ def test_two_processes_never_share_a_folder_and_a_kill_frees_it(tmp_path):
         assert holder.stdout.readline() == "open\n"
         with pytest.raises(UserError, match=r"x: another process is writing to it"):
             start(tmp_path / "x", overwrite=True)
+        with pytest.raises(UserError, match=r"x: another process is writing to it"):
+            runs.check_start(tmp_path / "x", resume=False, overwrite=False)  # what a command asks before anything slow
         holder.kill()
     start(tmp_path / "x", overwrite=True)
 
