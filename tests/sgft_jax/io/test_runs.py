@@ -124,7 +124,7 @@ def test_resume_names_every_field_that_differs(tmp_path):
         start(tmp_path / "x", kind="finetune", resume=True)
 
 
-def test_of_several_runs_all_open_or_none(tmp_path):
+def test_of_several_runs_all_open_or_none(tmp_path, monkeypatch):
     old, new = tmp_path / "old", tmp_path / "new"
     start(old)
     leave_a_checkpoint(old)
@@ -134,9 +134,13 @@ def test_of_several_runs_all_open_or_none(tmp_path):
             pass
         assert not new.exists()
     held = Lock(old)
-    together = opened(both, kind="pretrain", overwrite=True, say=lambda _: None)
-    with pytest.raises(UserError, match="old: another process is writing to it"), together:
-        pass
+    for begun in (False, True):  # the other process takes the folder before it is looked at, or right afterwards
+        assert not new.exists()
+        if begun:
+            monkeypatch.setattr(runs, "in_use", lambda folder: False)
+        together = opened(both, kind="pretrain", overwrite=True, say=lambda _: None)
+        with pytest.raises(UserError, match="old: another process is writing to it"), together:
+            pass
     held.release()
     assert [path.name for path in new.iterdir()] == [".lock"]  # not begun, and not locked any more
     with opened(both, kind="pretrain", overwrite=True, say=lambda _: None) as folders:
