@@ -404,7 +404,7 @@ def test_a_robot_is_fine_tuned_and_costs_no_evaluation(robot, port, tmp_path, ca
     *_, succeeded, results, following = capsys.readouterr().out.splitlines()
     assert re.fullmatch(r"remote: \d of 3 training rollouts have succeeded", succeeded)
     assert results == f"results: {folder}  (policy/, best/, real/, summary.json)"
-    wanted = f"--run {folder} --best --real remote::{port} --episodes 10 --out {tmp_path / 'runs'}"
+    wanted = f"--run {folder} --best --task {TASK} --real remote::{port} --episodes 10 --out {tmp_path / 'runs'}"
     assert following == f"next: python -m experiments.evaluate {wanted}"
     assert driver.steps == 3 * T and len(driver.starts) == len(set(driver.starts)) == 3
     names = sorted(path.name for path in (folder / "real").iterdir())
