@@ -110,7 +110,7 @@ def test_what_one_real_system_lacks_does_not_stop_the_others(tmp_path, ran):
 
 def test_a_file_without_a_name_means_all_of_its_gaps(tmp_path):
     file = tmp_path / "two.toml"
-    file.write_text("[a.params]\nmass = 9.0\n[b.params]\nmass = 2.0\n")
+    file.write_text("[a.params]\nobject_mass = 9.0\n[b.params]\nobject_mass = 2.0\n")
     args = compare.CompareArgs(tasks=("push",), methods=("sac",), reals=("sim", str(file)), out=tmp_path)
     assert [str(cell) for cell in compare.cells(args)] == ["push/sim: sac", "push/a: sac", "push/b: sac"]
 

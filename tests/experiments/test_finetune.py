@@ -315,7 +315,7 @@ def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
 
 def test_a_file_without_a_name_means_all_of_its_gaps(tmp_path, monkeypatch):
     file = tmp_path / "two.toml"
-    file.write_text("[a.params]\nmass = 9.0\n[b.params]\nmass = 2.0\n")
+    file.write_text("[a.params]\nobject_mass = 9.0\n[b.params]\nobject_mass = 2.0\n")
     save_prior(tmp_path / "prior/seed-0", 0, task="push")
     monkeypatch.setattr(finetune_run, "run", lambda args, *given: args.real)
     args = arguments("sac", prior=tmp_path / "prior", real=("sim", str(file)), out=tmp_path)
