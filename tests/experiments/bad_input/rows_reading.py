@@ -57,6 +57,7 @@ ROWS = [
     ("diagnose --prior nowhere", "--prior nowhere: no such folder"),
     ("diagnose --prior prior --rollouts 0", "--rollouts is 0: must be at least 1"),
     ("diagnose --prior prior --rollouts 99999999999999999999", "--rollouts is 99999999999999999999: must be at most 2"),
+    ("diagnose --prior prior --real runs/nope", "error: runs/nope: no such folder"),
     ("diagnose --prior prior --real nope", "gap of push: there is no 'nope'"),
     ("diagnose --prior prior --real empty", "--real empty: holds no recorded rollouts (real/rollout-*.npz)"),
     ("diagnose --prior prior --real fifo", "gap of push: there is no 'fifo'"),
