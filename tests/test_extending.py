@@ -169,7 +169,7 @@ def test_the_method_keeps_the_settings_of_sgft_sac(prior, monkeypatch):
     found = {}
     for name, method in (("own", get_method(METHOD)), ("ours", get_method("sgft-sac"))):
         tuner = method.build(method.config(), known, env)
-        state = jax.eval_shape(lambda t=tuner: t.init(known.params, jax.random.key(0), None))
+        state = jax.eval_shape(lambda t=tuner: t.init(known.params, jax.random.key(0)))
         jax.eval_shape(lambda s, t=tuner: t.learn(s, jax.random.key(0), 1), state)
         found[name] = seen["config"], jax.tree.map(jnp.shape, seen["batch"]), tuner.updates_per_rollout
     assert found["own"] == found["ours"]

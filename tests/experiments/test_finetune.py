@@ -411,7 +411,7 @@ def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatc
     def crash(*_):
         raise RuntimeError("the learner died")
 
-    monkeypatch.setattr(finetuning._Steps, "_observe", crash)
+    monkeypatch.setattr(finetuning._Steps, "_take", crash)
     with pytest.raises(RuntimeError, match="the learner died"):
         finetune.main(argv(home, "sac", out=tmp_path))
     real = rollouts(tmp_path / "finetune/toy/turned/sac/seeds-0-1")

@@ -166,6 +166,7 @@ def test_the_phases_of_every_command():
     assert {path.stem: phases for path in files if (phases := announced(path))} == {
         "benchmark": {"measuring ...: ..."},
         "collect_run": {"compiling the training", "playing the episodes to record"},
+        "demo": {"waiting for ..."},
         "diagnose_run": {"playing ... of each prior", "examining the rollouts"},
         "evaluate": {"building ... worlds for each system", "playing ... episodes for each policy"},
         "export": {"exporting to ... and comparing actions"},

@@ -100,7 +100,8 @@ def test_no_key_is_used_twice(name):
 
     def whole(key):
         parts = jax.random.split(key, 4)
-        state = plain.init(case.params, parts[0], case.data)
+        state = plain.init(case.params, parts[0])
+        state = plain.prepare(state, case.data) if case.data else state
         offline = plain.learn(state, parts[1], 1, case.data, offline=True) if case.data else ()
         learned = plain.learn(state, parts[2], 1, case.data)
         return offline, learned, plain.act(state, plain.init_carry(), OBS, parts[3], explore=True)

@@ -139,7 +139,7 @@ def test_learning_rates_of_the_simulators_networks_rise_from_zero(name, models):
 def test_a_fresh_state_has_buffers_of_its_own(name):
     """Whoever gets it may donate it, and the prior survives."""
     case = tuner(name)
-    state = case.plain.init(case.params, jax.random.key(0), case.data)
+    state = case.plain.init(case.params, jax.random.key(0))
     buffers = [x.unsafe_buffer_pointer() for x in jax.tree.leaves((state, case.params)) if x.size]
     assert len(buffers) == len(set(buffers))
 
@@ -303,7 +303,7 @@ def test_the_simulators_transitions_as_the_models_have_them(seen):
     plain = tuners.build("sgft-relabel", clip_shaped=None, train_dynamics=False)
     data = tuners.simulated().of(0)
     far = data._replace(draw=lambda key, n: (rows := data.draw(key, n))._replace(obs=rows.obs + 5.0))
-    state = plain.init(prior().params, jax.random.key(0), far)
+    state = plain.init(prior().params, jax.random.key(0))
     state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0))
     with jax.disable_jit():
         plain.learn(state, jax.random.key(1), 1, far)
@@ -383,7 +383,7 @@ def counting(transform):
     )
     parts = Parts(
         learner=learner,
-        start=lambda params, key, simulated: (learner.init(key), None),
+        start=lambda params, key: (learner.init(key), None),
         act=learner.act,
         export=lambda state: state.learner,
         policy=Policy(learner.init_carry, learner.act, lambda params, obs: params),
