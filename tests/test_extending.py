@@ -109,12 +109,12 @@ def test_worlds_differ_in_what_the_parameters_say(key):
 @pytest.mark.parametrize(
     ("right", "wrong", "words"),
     [
-        ('type="slide"', 'type="slid"', r"invalid keyword: 'slid'; Element 'joint', line 6$"),
-        ('mass="0.2"', 'mass="-1"', r"mass, .* negative in geom; Element name 'tip', id 0, line 6$"),
+        ('type="slide"', 'type="slid"', r"invalid keyword: 'slid'; Element 'joint', line 7$"),
+        ('mass="0.2"', 'mass="-1"', r"mass, .* negative in geom; Element name 'tip', id 0, line 7$"),
         (
             'joint="pusher" kp',
             'joint="puser" kp',
-            r"unknown transmission target 'puser' .*; Element name '', id 0, line 10",
+            r"unknown transmission target 'puser' .*; Element name '', id 0, line 11",
         ),
         ("</mujoco>", "", r"XML parse error 15; Error=XML_ERROR_PARSING .* Line number=2$"),
     ],
