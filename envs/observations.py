@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.spatial.transform import Rotation
 
 from envs.base import (
     NOTHING,
@@ -27,6 +26,7 @@ from envs.base import (
 )
 from envs.domains import parameter_ranges
 from envs.effects import make_range
+from envs.mujoco.patches import patches
 from envs.types import Array, Key, PyTree, UserError
 
 
@@ -209,11 +209,14 @@ def simulator(
     everything else is as the simulator has it. No noise is added. A step with exploded physics changes nothing. The
     derivative is that of finite differences over 5 % of a number's range, by the system alone.
 
-    Worlds are compiled on the host, which no jitted search can ask for. So some are compiled now, and every field of
-    their models becomes a quadratic function of the domain parameters.
+    Its world is patched on the device, see `envs.mujoco.patches`.
     """
     first, measured = env.obs_dim, env.measured_dim
-    model_of, key = models_of(env, system), jax.random.key(0)
+    ranges = np.array([(p.nominal, p.nominal) for p in env.parameters], float).reshape(-1, 2)
+    rows = {p.name: row for p, row in zip(env.parameters, ranges, strict=True)}
+    for number in system:
+        rows.get(number.name, np.zeros(2))[:] = number.low, number.high
+    model_of, key = patches(env, ranges).model, jax.random.key(0)
     place = {name: i for i, name in enumerate(_names(env))}
     where = np.array([place[v.name, v.index] for v in system])
     low, high = (np.array([getattr(v, end) for v in system]) for end in ("low", "high"))
@@ -226,7 +229,7 @@ def simulator(
         params, *parts = jnp.split(nominal.at[where].set(low + 0.5 * (1.0 + point) * (high - low)), sizes)
         drawn = Effects(*(part.reshape(x.shape) for part, x in zip(parts, usual, strict=True)))
         drawn = drawn._replace(latency_jitter=jnp.zeros(()))
-        return World(Theta(params, EffectRange(drawn, drawn)), model_of(point))
+        return World(Theta(params, EffectRange(drawn, drawn)), model_of(params))
 
     @jax.custom_jvp
     def change(obs: Array, action: Array) -> Array:
@@ -242,68 +245,6 @@ def simulator(
         return change(obs, action), 10.0 * (change(obs + step, action) - change(obs - step, action))
 
     return change
-
-
-def models_of(env: Env, system: tuple[Varying, ...]) -> Callable[[Array], dict[str, Array]]:
-    """A system [k] -> `World.model`: least squares over worlds compiled at random systems, quadratic in parameters."""
-    names = [p.name for p in env.parameters]
-    which = np.array([i for i, v in enumerate(system) if v.name in names], int)
-    low, high = (np.array([getattr(system[i], end) for i in which]) for end in ("low", "high"))
-    pairs = np.triu_indices(len(which))
-
-    def features(points: Array) -> Array:
-        return jnp.concatenate([jnp.ones(1), points, jnp.outer(points, points)[pairs]])
-
-    n = 2 * (1 + len(which) + len(pairs[0]))
-    points = np.random.default_rng(0).uniform(-1.0, 1.0, (n, len(which))).astype(np.float32)
-    params = np.tile([p.nominal for p in env.parameters], (n, 1))
-    params[:, [names.index(system[i].name) for i in which]] = low + 0.5 * (1.0 + points) * (high - low)
-    ends = make_range(env, env.training)
-    worlds = env.make_worlds(
-        Theta(jnp.asarray(params), jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), ends))
-    )
-    numbers = {k: x for k, x in worlds.model.items() if jnp.issubdtype(x.dtype, jnp.floating)}  # no codes of shortcuts
-    smooth = jax.vmap(with_tensors, axis_size=n)(numbers)
-    seen = np.asarray(jax.vmap(features)(jnp.asarray(points)), np.float64)
-
-    def fitted(values: Array) -> Array:
-        flat = np.asarray(values, np.float64).reshape(n, -1)
-        return jnp.asarray(np.linalg.lstsq(seen, flat, rcond=None)[0], jnp.float32)
-
-    weights = jax.tree.map(fitted, smooth)
-
-    def model(points: Array) -> dict[str, Array]:
-        inputs = features(points[which])
-        with jax.default_matmul_precision("highest"):
-            fields = {k: (inputs @ weights[k]).reshape(x.shape[1:]).astype(x.dtype) for k, x in smooth.items()}
-        return _with_axes(fields)
-
-    return model
-
-
-def with_tensors(model: dict[str, Array]) -> dict[str, Array]:
-    """Inertias [bodies, 3] as tensors [bodies, 3, 3]: unlike principal axes these do not jump from world to world."""
-    if not {"body_iquat", "body_inertia"} <= model.keys():
-        return model
-    axes = jax.vmap(lambda q: Rotation.from_quat(jnp.roll(q, -1)).as_matrix())(model["body_iquat"])
-    with jax.default_matmul_precision("highest"):
-        tensors = jnp.einsum("bij,bj,bkj->bik", axes, model["body_inertia"], axes)
-    return {k: x for k, x in model.items() if k != "body_iquat"} | {"body_inertia": tensors}
-
-
-def _with_axes(model: dict[str, Array]) -> dict[str, Array]:
-    """The reverse of `with_tensors`."""
-    if model.get("body_inertia", jnp.zeros(0)).ndim < 3:
-        return model
-
-    def axes_of(tensor: Array) -> tuple[Array, Array]:
-        size = jnp.abs(tensor).max() + 1e-12
-        inertia, axes = jnp.linalg.eigh(tensor / size)
-        axes = axes.at[:, 0].multiply(jnp.sign(jnp.linalg.det(axes)))
-        return size * inertia, jnp.roll(Rotation.from_matrix(axes).as_quat(), 1)
-
-    inertia, quat = jax.vmap(axes_of)(model["body_inertia"])
-    return model | {"body_inertia": inertia, "body_iquat": quat}
 
 
 def _names(env: Env) -> list[tuple[str, int]]:

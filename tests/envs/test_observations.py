@@ -9,7 +9,7 @@ from compiled import compiled
 
 import envs
 from envs.base import Varying
-from envs.observations import blurred, concealed, models_of, varying, with_previous_actions, with_system
+from envs.observations import blurred, concealed, varying, with_previous_actions, with_system
 from envs.rollout import play_episode
 from envs.types import UserError
 
@@ -106,10 +106,6 @@ def test_what_the_simulator_says_has_a_derivative_by_the_system(key):
     slope = jax.jacfwd(lambda told: change(obs.at[-3:].set(told), action))(jnp.zeros(3))
     # At mass 1 a step adds dt F / m = 0.1 * 4 * scale * action to the velocity; the ranges' halves are 0.2, 0.5, 0.4.
     np.testing.assert_allclose(slope[2:], [[-0.04, 0.1, -0.04], [-0.02, 0.0, 0.08]], atol=2e-3)
-
-
-def test_models_are_nothing_where_worlds_have_none():
-    assert models_of(TOY, SYSTEM)(jnp.zeros(3)) == {}
 
 
 def test_tasks_that_cannot_be_set_to_what_is_measured_have_no_simulator_to_ask():
