@@ -26,7 +26,7 @@ from envs.base import (
 )
 from envs.domains import parameter_ranges
 from envs.effects import make_range
-from envs.mujoco.patches import patches
+from envs.patches import patches
 from envs.types import Array, Key, PyTree, UserError
 
 
@@ -209,7 +209,7 @@ def simulator(
     everything else is as the simulator has it. No noise is added. A step with exploded physics changes nothing. The
     derivative is that of finite differences over 5 % of a number's range, by the system alone.
 
-    Its world is patched on the device, see `envs.mujoco.patches`.
+    Its world is patched on the device, see `envs.patches`.
     """
     first, measured = env.obs_dim, env.measured_dim
     ranges = np.array([(p.nominal, p.nominal) for p in env.parameters], float).reshape(-1, 2)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import envs
 from envs.base import Theta
 from envs.effects import make_range
-from envs.mujoco.patches import patches
+from envs.patches import patches
 
 DISTRIBUTIONS = Path(envs.__file__).parent / "gaps/distributions"
 WORLDS = 24
