@@ -33,7 +33,7 @@ class DemoArgs:
     task: str = "insert"
     """A task by name."""
     prior: Path = Path("shipped:insert-cpu")
-    """Folder of a prior. The default is what `pretrain --task insert --preset cpu` makes in two minutes: a weak
+    """Folder of a prior. The default is what `pretrain --task insert --preset cpu` makes in three minutes: a weak
     one, where methods differ (docs/results.md)."""
     real: str = "default"
     """The real system, as in fine-tuning."""
