@@ -175,8 +175,8 @@ class Programs(NamedTuple):
 def make_programs(finetuner: Finetuner) -> Programs:
     """The programs of a method; each compiles when it is first called, if it has not been compiled before."""
 
-    def prepare(state: PyTree, which: Array, rows: SimulatedRows | None) -> PyTree:
-        return finetuner.prepare(state, None if rows is None else rows.of(which))
+    def prepare(state: PyTree, which: Array, rows: SimulatedRows) -> PyTree:
+        return finetuner.prepare(state, rows.of(which))
 
     def judge(best: Best, agent: PyTree, played: Episode, age: Array) -> Best:
         outcome = played.score[:, 0], played.total_reward[:, 0], played.exploded[:, 0]

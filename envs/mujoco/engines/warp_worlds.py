@@ -10,13 +10,13 @@ import contextlib
 import dataclasses
 import hashlib
 import math
-import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import mujoco
+import numpy as np
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
@@ -189,7 +189,9 @@ def compile_kernels(host: mujoco.MjModel, layout: Sequence[str], **size: int) ->
     """
     if not wp.is_cuda_available():
         return
-    facts = pickle.dumps((mujoco.__version__, wp.get_device("cuda").arch, host, layout, size))
+    model = np.empty(mujoco.mj_sizeModel(host), np.uint8)
+    mujoco.mj_saveModel(host, None, model)
+    facts = repr((mujoco.__version__, wp.get_device("cuda").arch, layout, size)).encode() + model.tobytes()
     # Empty, and named so that it goes when somebody empties Warp's cache.
     note = Path(wp.config.kernel_cache_dir) / f"wp_sgft_{hashlib.sha256(facts).hexdigest()[:16]}"
     if not note.exists():
