@@ -6,6 +6,8 @@
 import functools
 import importlib
 import math
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -90,6 +92,34 @@ def run(args: "PretrainArgs", seeds: list[int], home: Path) -> dict[str, Any]:
             return _Run(args, env, gap, record).work()
 
 
+class _Writer:
+    """Writes one state after the other while training goes on; the end of its `with` block waits for the last one."""
+
+    def __init__(self) -> None:
+        self._pool = ThreadPoolExecutor(1, "checkpoints")
+        self._writing: Future[object] | None = None
+
+    def __enter__(self) -> "_Writer":
+        return self
+
+    def write(self, state: PyTree, write: Callable[[PyTree], object]) -> None:
+        """Begins to write a state, which may then be donated; raises what stopped the one before."""
+        self._settle()  # in memory there is one copy at most
+        copies = checkpoint.copied(mesh.local(state))
+        self._writing = self._pool.submit(write, copies)
+        if jax.process_count() > 1:
+            self._settle()  # hosts meet when they write, and nowhere else meanwhile
+
+    def _settle(self) -> None:
+        if self._writing is not None:
+            writing, self._writing = self._writing, None
+            writing.result()
+
+    def __exit__(self, *failure: object) -> None:
+        self._pool.shutdown()
+        self._settle()
+
+
 class _Run(Training):
     """Pretraining of the seeds [S] of a record."""
 
@@ -113,7 +143,7 @@ class _Run(Training):
 
     def work(self) -> dict[str, Any]:
         """Everything, in order."""
-        with compiling() as ahead:
+        with compiling() as ahead, _Writer() as self.writer:
             ahead.begin(self.env.prepare)
             state, done = None, 0
             for saved, meta in self.restore(lambda: jax.eval_shape(self._saved, self.shapes().state)):
@@ -132,7 +162,7 @@ class _Run(Training):
             self.follow(steps, done)
             assert self.best is not None  # evaluated before the first chunk
             ahead.wait(self.measure)
-        summary = self._hand_over(self.best)
+            summary = self._hand_over(self.best)
         self.record.log.close()
         return summary
 
@@ -198,7 +228,7 @@ class _Run(Training):
             ahead.wait(self.env.prepare, self.programs.collect)
             rows = self.programs.collect(self.pools(0), seed_keys(self.seeds, Pretraining.RANDOM))
             random = jax.block_until_ready(rows)
-        checkpoint.save(folder, 0, mesh.local(random), meta=expect)
+        self.writer.write(random, functools.partial(checkpoint.save, folder, 0, meta=expect))
         return random
 
     # ------------------------------------------------------------ between chunks
@@ -225,7 +255,8 @@ class _Run(Training):
     def checkpoint(self, state: FleetState, done: int) -> None:
         assert self.best is not None  # evaluated before the first chunk
         step = done // self.config.chunk_env_steps
-        self.record.checkpoint(Saved(state, self.best), step, env_steps=done, seconds=self.clock.seconds)
+        write = self.record.checkpointer(step, env_steps=done, seconds=self.clock.seconds)
+        self.writer.write(Saved(state, self.best), write)
 
     # ------------------------------------------------------------ what stays
 

@@ -15,6 +15,7 @@ from envs import mesh
 from envs.rollout import Episode, counted
 from envs.types import Array, Key, Policy, PyTree, UserError
 from experiments.runner.progress import RunProgress, doing
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import Clock, MetricsLog, check_finite
 from sgft_jax.io.priors import save_prior
@@ -54,8 +55,16 @@ class Record:
 
     def checkpoint(self, state: PyTree, step: int, **facts: Any) -> None:
         """The state, what else is known at this step, and how long the logs are."""
-        meta = {**self.expect, **facts, "position": self.log.position()}
-        self.last_good = checkpoint.save(self.home, step, mesh.local(state), meta=meta)
+        self.checkpointer(step, **facts)(mesh.local(state))
+
+    def checkpointer(self, step: int, **facts: Any) -> Callable[[PyTree], None]:
+        """What writes a state with the facts and logs of this moment, though it be called later."""
+        meta = jsonable({**self.expect, **facts, "position": self.log.position()})
+
+        def write(state: PyTree) -> None:
+            self.last_good = checkpoint.save(self.home, step, state, meta=meta)
+
+        return write
 
     def save_policies(self, kind: str, params: PyTree, card: Callable[[int], Mapping[str, Any]]) -> None:
         """Policies [S] in the form of priors: <kind>/seed-<k>. card(seed) -> what the card of one says."""

@@ -80,6 +80,11 @@ def save(folder: Path, step: int, state: PyTree, *, meta: Mapping[str, Any], kee
     return root / str(step)
 
 
+def copied(tree: PyTree) -> PyTree:
+    """The same arrays in the host's memory, to `save` while the originals are donated."""
+    return jax.tree.map(lambda x: x.copy() if _is_key(x) else np.array(x), tree)
+
+
 def latest(folder: Path, *, whole: bool = False, say: Callable[[str], None] = print) -> int | None:
     """The newest step with a complete checkpoint, or None without any; `say` hears of every one that was passed over.
 

@@ -94,6 +94,17 @@ def test_restore_into_an_abstract_state(tmp_path, key):
     assert bits(state) == bits(learner)
 
 
+def test_copies_outlive_a_donated_state(tmp_path):
+    """A checkpoint is written while the next chunk of training uses the memory of its state."""
+    state = make_state(1)
+    kept = bits(state)
+    copies = checkpoint.copied(state)
+    used = jax.jit(lambda state: jax.tree.map(lambda x: x if checkpoint._is_key(x) else x + 1, state), donate_argnums=0)
+    jax.block_until_ready(used(state))
+    checkpoint.save(tmp_path, 1, copies, meta={})
+    assert bits(checkpoint.restore(tmp_path, make_state())[0]) == kept
+
+
 def test_a_state_without_any_elements(tmp_path):
     checkpoint.save(tmp_path, 1, {"a": jnp.zeros((0, 2), jnp.int8)}, meta={})
     state, _ = checkpoint.restore(tmp_path, {"a": jnp.zeros((0, 2), jnp.int8)})
