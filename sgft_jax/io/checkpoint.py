@@ -81,8 +81,8 @@ def save(folder: Path, step: int, state: PyTree, *, meta: Mapping[str, Any], kee
 
 
 def copied(tree: PyTree) -> PyTree:
-    """The same arrays in the host's memory, to `save` while the originals are donated."""
-    return jax.tree.map(lambda x: x.copy() if _is_key(x) else np.array(x), tree)
+    """The same arrays in the host's memory, to `save` while the originals are donated: JAX keeps what NumPy sees."""
+    return jax.tree.map(lambda x: x.copy() if _is_key(x) else np.asarray(x), tree)
 
 
 def latest(folder: Path, *, whole: bool = False, say: Callable[[str], None] = print) -> int | None:
