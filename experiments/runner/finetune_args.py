@@ -17,6 +17,7 @@ from experiments.runner.real_systems import check as check_real
 from sgft_jax.files.disk import jsonable
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.presets import DEFAULT_PRESET, preset_of
+from sgft_jax.train.options import loop_of
 from sgft_jax.types import Online
 
 NO_PRIOR = Path("none")
@@ -179,7 +180,7 @@ def _check_robot(args: FinetuneArgs) -> None:
         raise UserError(f"--seeds {args.seeds}: one robot plays one seed; give --seeds 1")
     if args.hand_over == "steps" and not robot:
         raise UserError("--hand-over steps: only a robot plays while something learns; name it with --real remote")
-    if args.hand_over == "steps" and args.options.guard:
+    if args.hand_over == "steps" and loop_of(args.options).guard:
         raise UserError(
             "--hand-over steps: a guard judges rollouts by one policy; add --options.no-guard or leave it out"
         )

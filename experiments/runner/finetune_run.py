@@ -41,7 +41,7 @@ from sgft_jax.systems.simulated import KnownSystem, Simulated, System
 from sgft_jax.train import finetuning, simulation
 from sgft_jax.train.finetuning import FinetuneProgress, Programs
 from sgft_jax.train.learner_process import LearnerProcess
-from sgft_jax.train.options import card_of
+from sgft_jax.train.options import card_of, loop_of
 from sgft_jax.types import Finetuner, Metrics, Online, Prior
 
 if TYPE_CHECKING:
@@ -106,7 +106,8 @@ def run(
 def _reserve(args: "FinetuneArgs", env: Env, priors: int, devices: int) -> None:
     """Raises UserError where the devices have no room for the transitions of all members."""
     row, members = 4 * (2 * env.obs_dim + env.act_dim + 2), args.seeds * len(args.real)
-    kept = {name: row * members * getattr(args.options, name) for name in ("replay_capacity", "batch_size")}
+    loop = loop_of(args.options)
+    kept = {name: row * members * getattr(loop, name) for name in ("replay_capacity", "batch_size")}
     kept["simulated_transitions"] = row * priors * getattr(args.options, "simulated_transitions", 0)
     reserve(kept, copies=1, devices=devices, settings="options")
 
@@ -265,7 +266,7 @@ class _Run(Training):
         stores = [record.real for record in self.records]
         logged = None
         if self.logs:
-            sizes = {"capacity": args.options.replay_capacity, "updates": args.real_updates}
+            sizes = {"capacity": loop_of(args.options).replay_capacity, "updates": args.real_updates}
             logged = begin_with(self.logs, self.finetuner, self.system.env, **sizes)
         how: dict[str, Any] = {"waits": args.hand_over == "rollouts", "logged": logged}
         with compiling() as ahead:

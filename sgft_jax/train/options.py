@@ -3,7 +3,7 @@
 Command lines read this module and the method files: they import neither JAX nor Flax at the top.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, Any, ClassVar
 
 from sgft_jax import checks
@@ -168,6 +168,12 @@ class ShapedOptions(KeptCriticOptions):
 
 
 # --- options left open ------------------------------------------------------------------------------------------------
+
+
+def loop_of(options: Any) -> LoopOptions:
+    """What every method's loop has, of options that may name only some of it: the rest has its defaults."""
+    names = [field.name for field in fields(LoopOptions) if hasattr(options, field.name)]
+    return LoopOptions(**{name: getattr(options, name) for name in names})
 
 
 def updates_per_rollout(options: LoopOptions, task: Task) -> int:

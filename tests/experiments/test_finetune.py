@@ -37,7 +37,7 @@ from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
 from sgft_jax.io.real import RealStore
-from sgft_jax.methods import get_method
+from sgft_jax.methods import NAMES, get_method
 from sgft_jax.stacking import member
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
@@ -328,6 +328,15 @@ def test_a_variant_has_a_folder_beside_its_method():
 
 
 # --- killed and resumed -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", NAMES)
+def test_every_method_is_told_what_it_takes(method):
+    """`recurrent` and `sysid` learn nothing and name no batch; the room for their transitions is counted too."""
+    args = arguments(method, real=("sim",))
+    finetune_run._reserve(args, toy.make(), priors=1, devices=1)
+    with pytest.raises(UserError, match="replay-capacity"):
+        finetune_run._reserve(dataclasses.replace(args, seeds=2**40), toy.make(), priors=1, devices=1)
 
 
 @pytest.mark.slow
