@@ -20,6 +20,16 @@ Numbers = float | list[float] | list[list[float]]
 Value = Numbers | Mapping[str, Numbers]  # the latter by entry name, see `effects.make_range`
 NOTHING: Mapping[str, Value] = MappingProxyType({})
 _FARTHEST = 1000.0
+# How commands of a real system may err beside its effects, see `envs.commands`: by name the greatest value, the least
+# is 0. In units of the command's range [-1, 1]:
+#   warp: largest length of an error vector that depends smoothly on where the hand is; warp_seed draws which.
+#   dead_band: the size up to which a command does nothing, on each axis; of larger ones the excess passes.
+#   backlash: the play of each axis: after a reversal the first commands move nothing, until they add up to it.
+# Others: late: control periods until a command is in force, zero before the first. lost: probability that a command is
+# lost: the one before it is repeated.
+COMMANDS: Mapping[str, float] = MappingProxyType(
+    {"warp": 2.0, "warp_seed": 2.0**32 - 1, "dead_band": 1.0, "backlash": 10.0, "late": 3.0, "lost": 1.0}
+)
 
 
 class Entry(NamedTuple):
@@ -119,10 +129,12 @@ class World(NamedTuple):
     """One system to interact with; stack worlds along a leading axis and vmap.
 
     model: the fields of the simulator's model that differ between worlds, as its compiler left them, by name.
+    commands: how commands err, `envs.commands.Commands`; () where nobody asks.
     """
 
     theta: Theta
     model: dict[str, Array]
+    commands: PyTree = ()
 
 
 class EnvState(NamedTuple):
@@ -196,6 +208,9 @@ class Env(NamedTuple):
     actuators: effects of a simulator whose actuators differ too, see `envs.domains`; those not named have
         the ranges given there.
     cartesian: the first two action entries are x and y of one frame.
+    workspace: (lowest, highest) of the first numbers of the observation, where hands move, raw units; numbers that do
+        not vary may be among them. () where nobody declares it: then no gap can warp commands.
+    commands: whether worlds say how commands err, see `envs.commands`.
     check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
     trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn. Commands that record put
         another function in its place, which may return a pytree.
@@ -228,6 +243,8 @@ class Env(NamedTuple):
     training: Mapping[str, Value] = NOTHING
     actuators: Mapping[str, Value] = NOTHING
     cartesian: bool = False
+    workspace: tuple[tuple[float, float], ...] = ()
+    commands: bool = False
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
     trace: Callable[[PyTree], PyTree] = no_trace
     previous_actions: int = 0
@@ -273,6 +290,8 @@ def entries_of(env: Env, effect: str) -> tuple[Entry, ...]:
 
 def misnamed(env: Env, name: str) -> UserError:
     """What to tell someone who named a domain parameter or an effect that the task does not have there."""
+    if name in COMMANDS:
+        return UserError(f"'{name}' belongs in the 'commands' of a gap: it is no parameter and no effect of {env.name}")
     lists = {"parameter": [p.name for p in env.parameters], "effect": list(Effects._fields)}
     for kind, names in lists.items():
         if name in names:

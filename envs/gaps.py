@@ -1,7 +1,8 @@
 """Impure: gaps, how a "real" system differs from the simulator, as data. Reads TOML and JSON files, writes TOML.
 
 A gap names only what differs; everything else stays as in training. `params` fixes domain parameters (or gives them
-another range), also outside the training range; `effects` distorts commands and measurements, see `envs.base.Effects`.
+another range), also outside the training range; `effects` distorts commands and measurements, see `envs.base.Effects`;
+`commands` are errors of commands that the simulator never has, see `envs.base.COMMANDS`.
 `scene` names another scene than the simulated one, see `envs.make`: a towel where the simulator has a puck. `families`
 says which kinds of difference were drawn, see `envs.gap_distribution`, and `stratum` how often the simulator's policies
 succeed there, see `experiments.gaps`; only tables read them.
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from envs import extend
-from envs.base import Effects, Env, Value, World
+from envs.base import COMMANDS, NOTHING, Effects, Env, Value, World
 from envs.files import parse_json, read_json, read_toml
 from envs.types import Key, UserError, unknown
 
@@ -25,7 +26,7 @@ __all__ = ["Gap", "changes", "each", "find", "from_dict", "load", "presets", "re
 __all__ += ["usual", "worlds"]
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
-_KEYS = frozenset({"params", "effects", "scene", "families", "stratum"})
+_KEYS = frozenset({"params", "effects", "commands", "scene", "families", "stratum"})
 _FILE = re.compile(r"(.*\.(?:toml|json))(?::(.+))?")  # a file, or one gap of a file
 
 
@@ -34,7 +35,7 @@ class Gap(NamedTuple):
 
     Ranges are [low, high], of vectors [[low, ...], [high, ...]]; a vector may be a table by entry name, see
     `envs.effects.make_range`. Every episode draws its effects from their ranges. families: of a gap that was drawn.
-    stratum: "solved", "partial" or "failed" of one that was measured too.
+    stratum: "solved", "partial" or "failed" of one that was measured too. commands: their errors.
     """
 
     name: str
@@ -43,6 +44,13 @@ class Gap(NamedTuple):
     scene: str = ""
     families: tuple[str, ...] = ()
     stratum: str = ""
+    commands: Mapping[str, float] = NOTHING
+
+    @property
+    def table(self) -> dict[str, Any]:
+        """For files, every field by its name: `commands` only where there are any, as in files of before."""
+        table = self._asdict()
+        return table if self.commands else {name: table[name] for name in table if name != "commands"}
 
 
 def presets(task: str, *, variants: bool = True) -> dict[str, Gap]:
@@ -123,11 +131,11 @@ def title(source: str) -> str:
 def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
     """The gap that `find` finds, changed by overrides such as "latency=0.05". Raises UserError naming file and key."""
     gap = find(env.name, source)
-    params, effects = dict(gap.params), dict(gap.effects)
+    params, effects, commands = dict(gap.params), dict(gap.effects), dict[str, Any](gap.commands)
     for name, value in changes(overrides).items():
-        (effects if name in Effects._fields else params)[name] = value
+        (effects if name in Effects._fields else commands if name in COMMANDS else params)[name] = value
     words = ["=".join(part.strip() for part in text.partition("=")[::2]) for text in overrides]
-    gap = gap._replace(name="+".join([gap.name, *words]), params=params, effects=effects)
+    gap = gap._replace(name="+".join([gap.name, *words]), params=params, effects=effects, commands=commands)
     _check(env, gap)
     return gap
 
@@ -141,17 +149,21 @@ def from_dict(env: Env, name: str, table: Mapping[str, Any]) -> Gap:
 
 def worlds(env: Env, gap: Gap, key: Key, n: int = 256) -> World:
     """The real system of a gap as a pool of worlds [n], or [1] where its domain parameters do not vary."""
+    from envs.commands import given
     from envs.domains import parameter_ranges, sample_worlds
 
     low, high = parameter_ranges(env, gap.params).T
-    return sample_worlds(env, key, n if (low < high).any() else 1, params=gap.params, effects=gap.effects)
+    pool = sample_worlds(env, key, n if (low < high).any() else 1, params=gap.params, effects=gap.effects)
+    return given(env, pool, gap.commands) if gap.commands else pool
 
 
 def to_toml(listed: Iterable[Gap]) -> str:
     """Gaps as the text of a file that holds several, for people too. `read_file` gives back the same gaps."""
     lines: list[str] = []
     for gap in listed:
-        values = {name: getattr(gap, name) for name in ("stratum", "scene", "families", "params", "effects")}
+        values = {
+            name: getattr(gap, name) for name in ("stratum", "scene", "families", "params", "effects", "commands")
+        }
         lines += ["", f"[{_key(gap.name)}]", *(f"{name} = {_inline(value)}" for name, value in values.items() if value)]
     return "\n".join([*lines[1:], ""])
 
@@ -177,8 +189,8 @@ def _parse(name: str, table: Any, *, where: str) -> Gap:
     if not isinstance(table, dict) or set(table) - _KEYS:
         odd = sorted({*table} - _KEYS)[0] if isinstance(table, dict) else type(table).__name__
         raise UserError(
-            f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene', "
-            "'families' and a 'stratum'"
+            f"{where}: unexpected '{odd}'; a gap has tables 'params', 'effects' and 'commands', and may name a "
+            "'scene', 'families' and a 'stratum'"
         )
     families = table.get("families", [])
     if not isinstance(families, list) or not all(isinstance(family, str) for family in families):
@@ -186,14 +198,15 @@ def _parse(name: str, table: Any, *, where: str) -> Gap:
     words = {key: table.get(key, "") for key in ("scene", "stratum")}
     if odd := [key for key, word in words.items() if not isinstance(word, str)]:
         raise UserError(f"{where}: '{odd[0]}' must be a name, got {words[odd[0]]!r}")
-    gap = Gap(name, table.get("params", {}), table.get("effects", {}), families=tuple(families), **words)
-    for section, values in (("params", gap.params), ("effects", gap.effects)):
+    tables = {section: table.get(section, {}) for section in ("params", "effects", "commands")}
+    for section, values in tables.items():
         if not isinstance(values, dict):
             raise UserError(f"{where}: '{section}' must be a table of names and numbers, got {values!r}")
         for key, value in values.items():
             if not _is_value(value):
                 raise UserError(f"{where}: '{key}' must be a number or a list of numbers, got {value!r}")
-    return gap
+    _check_commands(where, tables["commands"])
+    return Gap(name, **tables, families=tuple(families), **words)
 
 
 def _is_value(value: Any) -> bool:
@@ -220,11 +233,26 @@ def changes(overrides: Sequence[str]) -> dict[str, Value]:
     return values
 
 
+def _check_commands(where: str, values: Mapping[str, Any]) -> None:
+    """Raises UserError for unknown names and impossible values."""
+    for name, value in values.items():
+        if name not in COMMANDS:
+            raise UserError(f"{where}: {unknown("error of 'commands'", name, COMMANDS)}")
+        whole = name in ("late", "warp_seed")
+        if not isinstance(value, int | float) or not 0 <= value <= COMMANDS[name] or (whole and value != int(value)):
+            number = "a whole number" if whole else "one number"
+            raise UserError(f"{where}: '{name}' must be {number} from 0 to {COMMANDS[name]:.10g}, got {value}")
+
+
 def _check(env: Env, gap: Gap) -> None:
     """Raises UserError for unknown names and impossible values."""
+    from envs.commands import make_commands
     from envs.domains import uniform
 
+    _check_commands(f"gap '{gap.name}'", gap.commands)
     try:
         uniform(env, gap.params, gap.effects)
+        if gap.commands:
+            make_commands(env, gap.commands)
     except UserError as error:
         raise UserError(f"gap '{gap.name}': {error}") from None

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import envs
 from envs import gaps
 from envs.base import Env, EnvState, World
+from envs.commands import with_commands
 from envs.domains import sample_worlds
 from envs.gaps import SIM, Gap
 from envs.mesh import split_vmap
@@ -71,7 +72,8 @@ def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None
 def real_env(env: Env, real_gaps: Sequence[Gap]) -> Env:
     """The Env of these real systems: that of the simulator, or of the other scene that they name.
 
-    None of them tells what system it is, see `envs.observations.concealed`.
+    None of them tells what system it is, see `envs.observations.concealed`. Where commands of any err,
+    every world says how, see `envs.commands`.
 
     Raises UserError where they name several, which no one program can step.
     """
@@ -81,7 +83,9 @@ def real_env(env: Env, real_gaps: Sequence[Gap]) -> Env:
         differ = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
         raise UserError(f"{differ}: real systems of different scenes cannot share a program, run them one at a time")
     scene = "".join(scenes)
-    return concealed(envs.make(env.name, env.impl, scene, env.previous_actions, env.system) if scene else env)
+    real = envs.make(env.name, env.impl, scene, env.previous_actions, env.system) if scene else env
+    err = any(gap.commands for gap in real_gaps) and not real.commands
+    return concealed(with_commands(real) if err else real)
 
 
 def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:

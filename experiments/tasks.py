@@ -59,8 +59,7 @@ def describe(task: str) -> dict[str, Any]:
         ],
         "effects": _effects(env.training, sizes, cartesian=env.cartesian),
         "gaps": {
-            name: {k: x for k, x in gap._asdict().items() if x and k != "name"}
-            for name, gap in gaps.presets(name).items()
+            name: {k: x for k, x in gap.table.items() if x and k != "name"} for name, gap in gaps.presets(name).items()
         },
     }
 
@@ -108,7 +107,7 @@ def _task_lines(facts: dict[str, Any]) -> list[str]:
     reals = [("gap", "what differs from the simulator")]
     for name, gap in facts["gaps"].items():
         scene = [f"scene {gap['scene']}"] if "scene" in gap else []
-        values = {**gap.get("params", {}), **gap.get("effects", {})}
+        values = {**gap.get("params", {}), **gap.get("effects", {}), **gap.get("commands", {})}
         reals.append((name, "; ".join([*scene, *(f"{k} {_value(v)}" for k, v in values.items())])))
     length = f"{facts['episode_length']} steps of {facts['control_dt']:g} s = {seconds:g} s"
     head = [(part, _entries(facts[part])) for part in ("observation", "action")]

@@ -35,6 +35,7 @@ from sgft_jax.types import Finetuner, Online, Prior, Simulation
 __all__ = ["ActingPolicy", "Setup", "evaluate_prior", "finetuned_priors", "load_policy", "make_env", "setup"]
 
 SIMULATED_WORLDS = 256
+_PARTS = ("params", "effects", "scene", "commands")  # of the gap that a card names
 _SIMULATION = 2**31  # seed of what happens in them, the same for every run
 _EVALUATION = 2**31 + 2  # held out from training and from the choice of the prior
 
@@ -111,7 +112,7 @@ def _collected(
     """
     key, card, gap = jax.random.key(_SIMULATION), priors[0].card, None
     if (named := card.get("gap")) is not None:
-        gap = from_dict(env, named["name"], {part: named[part] for part in ("params", "effects", "scene")})
+        gap = from_dict(env, named["name"], {part: named[part] for part in _PARTS if part in named})
         env = real_env(env, [gap])
     worlds = training_worlds(env, gap, key, SIMULATED_WORLDS)
     return simulate(env, make_policy(card, env), worlds, stacked, key, needs, gamma=card["gamma"], heard=heard)

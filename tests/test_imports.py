@@ -50,7 +50,19 @@ ROOT = Path(__file__).parents[1]
 # The rooms of a package, a file or a folder each, lowest first: a room imports only rooms before it. "" is the package.
 ORDER = {
     "envs": (
-        *("types", "files", "extend", "mesh", "base", "effects", "domains", "patches", "observations", "gaps"),
+        *(
+            "types",
+            "files",
+            "extend",
+            "mesh",
+            "base",
+            "effects",
+            "commands",
+            "domains",
+            "patches",
+            "observations",
+            "gaps",
+        ),
         *("gap_distribution", "checks", "mujoco", "control", "franka", "locomotion", "", "rollout", "adapters"),
     ),
     "sgft_jax": (

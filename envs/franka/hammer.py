@@ -164,6 +164,7 @@ SCENE = arm.scene(
     episode_length=50,
     substeps=SUBSTEPS,
     # Joints sag under a tool more than Cartesian commands drift.
+    workspace=((0.28, 0.5), (0.0, 0.0), (0.44, 0.72)),
     actuators={**arm.NOISE, "action_scale": [[0.6] * 3, [1.4] * 3], "action_bias": [[-0.3] * 3, [0.3] * 3]},
     build=build,
     initial=initial,

@@ -147,6 +147,7 @@ SCENE = arm.scene(
     substeps=SUBSTEPS,
     success_anytime=True,
     cartesian=True,
+    workspace=((0.44, 0.56), (-0.06, 0.06), (GRASP - DEPTH, GRASP + 0.1)),  # of starts and holes
     actuators={**arm.NOISE, "action_scale": [[0.5] * 3, [1.4] * 3]},
     build=build,
     initial=initial,

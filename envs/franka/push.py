@@ -166,6 +166,7 @@ SCENE = arm.scene(
     episode_length=40,
     substeps=SUBSTEPS,
     cartesian=True,
+    workspace=tuple(zip(*WORKSPACE.tolist(), strict=True)),
     build=build,
     initial=initial,
     settled=settled,

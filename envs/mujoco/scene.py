@@ -59,8 +59,8 @@ class Scene(NamedTuple):
     motors(params, previous, target) -> [nu] the control that follows the last one, `previous` [nu], where motors are
         slower than a control period; default `target` at once.
     observe(params, state) -> [obs_dim] without measurement error, or a dict of vectors by entry name.
-    reward, terminated, success, success_anytime, score, training, actuators, cartesian, check, measures, table: see
-        `Env`.
+    reward, terminated, success, success_anytime, score, training, actuators, cartesian, workspace, check, measures,
+        table: see `Env`.
     measured(params, before, action, after) -> Measured: where reward, end or success are no functions of observations.
         `reward` may then approximate it; what is measured is what counts.
     event(params, state) -> state: what happens between control steps (a fallen object stays down); default nothing.
@@ -94,6 +94,7 @@ class Scene(NamedTuple):
     cartesian: bool = False
     training: Mapping[str, Value] = NOTHING
     actuators: Mapping[str, Value] = NOTHING
+    workspace: tuple[tuple[float, float], ...] = ()
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
     measures: Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]] = lambda next_obs, valid: {}
     table: bool = False

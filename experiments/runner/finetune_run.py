@@ -169,7 +169,7 @@ class FinetuneRecord(Record):
     def save(self, kind: str, params: PyTree, card: Mapping[str, Any]) -> None:
         """Policies [S], `policy` (the last ones) or `best`, whose cards add to `card`."""
         env = {"task": self.env.name, "obs_dim": self.env.obs_dim, "act_dim": self.env.act_dim}
-        facts = {"method": self.method, "gap": self.gap._asdict(), "which": kind}
+        facts = {"method": self.method, "gap": self.gap.table, "which": kind}
         self.save_policies(kind, params, lambda seed: {**card, **env, "finetuned": {**facts, "seed": seed}})
 
     def summarise(self, done: int, best: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -183,7 +183,7 @@ class FinetuneRecord(Record):
         curve = read_curve(self.folder).of(env.score) if evaluated else None
         far = {"rollouts": done, "transitions": self._transitions(), "robot_minutes": self._minutes()}
         numbers = {"final": far, "seeds": len(self.seeds)} if curve is None else describe(curve)
-        about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap._asdict()}
+        about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap.table}
         summary = about | {"score": env.score} | numbers | {"best": {k: x.tolist() for k, x in best.items()}}
         if self.logged:
             summary["logged"] = self.logged

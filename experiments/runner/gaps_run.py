@@ -94,7 +94,7 @@ def percent(rated: dict[str, Any] | None) -> str:
 def _line(gap: Gap, zero_shot: Episode, trained: Episode | None) -> dict[str, Any]:
     zero, best = rate(zero_shot), None if trained is None else rate(trained)
     verdict = admissible(zero["success"], None if best is None else best["success"])
-    return {"gap": gap._asdict(), "zero_shot": zero, "trained": best, "admissible": verdict}
+    return {"gap": gap.table, "zero_shot": zero, "trained": best, "admissible": verdict}
 
 
 def rate(played: Episode, statistic: Callable[..., np.ndarray] = stats.iqm) -> dict[str, Any]:

@@ -161,7 +161,7 @@ class _Run(Training):
         sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim, "control_dt": env.control_dt}
         sizes |= {"previous_actions": env.previous_actions}
         layout = {"observation": [e._asdict() for e in env.observation], "action": [e._asdict() for e in env.action]}
-        facts = {"method": self.method.name, "gap": gap._asdict(), "seed": seed, "data": self._facts()}
+        facts = {"method": self.method.name, "gap": gap.table, "seed": seed, "data": self._facts()}
         return {**self.agent.card, **sizes, **layout, "hybrid": facts, "provenance": runs.provenance()}
 
     def _facts(self) -> dict[str, Any] | None:
@@ -178,7 +178,7 @@ class _Run(Training):
         return {
             "task": self.env.name,
             "method": self.method.name,
-            "gap": gap._asdict(),
+            "gap": gap.table,
             "real": self.args.real,
             "impl": self.env.impl,
             "data": self._facts(),

@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 import envs
 from envs import extend, gaps
-from envs.base import Effects, misnamed
+from envs.base import COMMANDS, Effects, misnamed
 from envs.types import UserError, unknown
 from sgft_jax import checks, types
 from sgft_jax.files.disk import ASIDE, present
@@ -141,7 +141,7 @@ def check_task(task: str, reals: Sequence[str] = (), changes: Sequence[str] = ()
     name = envs.name_of(task)
     chosen, known = [gaps.find(name, real) for real in reals], gaps.presets(name)
     named = {x for gap in chosen if known.get(gap.name) != gap for x in (*gap.params, *gap.effects)}
-    if odd := [x for x in (*gaps.changes(changes), *sorted(named)) if x not in Effects._fields]:
+    if odd := [x for x in (*gaps.changes(changes), *sorted(named)) if x not in {*Effects._fields, *COMMANDS}]:
         scene = envs.scene(name)
         if scene and (strange := [x for x in odd if x not in [p.name for p in scene.parameters]]):
             raise misnamed(scene, strange[0])

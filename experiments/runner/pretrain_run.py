@@ -287,7 +287,7 @@ class _Run(Training):
             "task": self.env.name,
             "preset": self.args.preset,
             "impl": self.env.impl,
-            "gap": None if self.gap is None else self.gap._asdict(),
+            "gap": None if self.gap is None else self.gap.table,
             "env_steps": self.total,
             "updates": self.config.chunks * self.config.chunk_steps * self.config.updates_per_step,
             "seeds": results,
@@ -305,7 +305,7 @@ class _Run(Training):
         late = f"{self.config.choose_from:.0%} of training"
         return {
             **self.card,
-            "gap": None if self.gap is None else self.gap._asdict(),
+            "gap": None if self.gap is None else self.gap.table,
             "preset": self.args.preset,
             "chosen": f"the best evaluation in held-out worlds after {late}: {self.env.score}, then return",
             "metrics": facts,

@@ -106,8 +106,8 @@ class Table:
         if not isinstance(self.content.get("about"), dict):
             raise UserError(f"{path}: does not say how it was measured, an earlier version wrote it; {_ELSE}")
         for gap in gaps:
-            line = self.known.setdefault(gap.name, {"gap": jsonable(gap)})
-            if line["gap"] != jsonable(gap):
+            line = self.known.setdefault(gap.name, {"gap": jsonable(gap.table)})
+            if line["gap"] != jsonable(gap.table):
                 raise UserError(f"{path}: its {gap.name} is another gap; {_ELSE}")
             line |= labels(line)
 

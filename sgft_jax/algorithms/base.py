@@ -46,6 +46,7 @@ class _Gap(TypedDict):
     params: dict[str, Any]
     effects: dict[str, Any]
     scene: str
+    commands: NotRequired[dict[str, Any]]
 
 
 class Card(TypedDict):
