@@ -15,10 +15,11 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from envs import extend
-from envs.base import COMMANDS, NOTHING, Effects, Env, Value, World
+from envs.base import COMMANDS, Effects, Env, Value, World
 from envs.files import parse_json, read_json, read_toml
 from envs.types import Key, UserError, unknown
 
@@ -35,7 +36,7 @@ class Gap(NamedTuple):
 
     Ranges are [low, high], of vectors [[low, ...], [high, ...]]; a vector may be a table by entry name, see
     `envs.effects.make_range`. Every episode draws its effects from their ranges. families: of a gap that was drawn.
-    stratum: "solved", "partial" or "failed" of one that was measured too. commands: their errors.
+    stratum: "solved", "partial" or "failed" of one that was measured too. commands: how they err.
     """
 
     name: str
@@ -44,7 +45,7 @@ class Gap(NamedTuple):
     scene: str = ""
     families: tuple[str, ...] = ()
     stratum: str = ""
-    commands: Mapping[str, float] = NOTHING
+    commands: Mapping[str, float] = MappingProxyType({})
 
     @property
     def table(self) -> dict[str, Any]:

@@ -9,7 +9,6 @@ import toy
 import envs
 from envs import gaps
 from envs.commands import make_commands, warp, with_commands
-from envs.gaps import Gap
 from envs.observations import with_previous_actions
 from envs.rollout import real_env, real_worlds
 from envs.types import UserError
@@ -97,7 +96,7 @@ def test_a_warp_is_added_where_the_hand_is_and_its_seed_draws_another(key):
 
 def test_memory_ends_with_the_episode_and_systems_share_a_program(key):
     """One program steps a system without errors, one that is late and one with play; a reset forgets."""
-    listed = [Gap("sim", EXACT["params"], EXACT["effects"]), gap(late=3), gap(backlash=2.0)]
+    listed = [gaps.from_dict(TOY, "exact", EXACT), gap(late=3), gap(backlash=2.0)]
     system = real_env(TOY, listed)
     pools = jax.tree.map(lambda x: x[:, 0], real_worlds(system, listed, key))
     states = jax.vmap(system.reset, (0, None))(pools, key)
@@ -123,6 +122,7 @@ def test_observations_tell_what_was_commanded_not_what_arrived(key):
     np.testing.assert_allclose(state.obs[4:], [0.3, 0.0, 0.2, 0.0], atol=1e-6)
     system = real_env(seeing, [errors])
     world = jax.tree.map(lambda x: x[0], gaps.worlds(system, errors, key))
+    assert system.restore is not None
     restored = system.restore(world, state.obs, key)
     np.testing.assert_allclose(restored.obs, state.obs, atol=1e-6)
     np.testing.assert_allclose(restored.physics[1].asked[:, 0], [0.3, 0.2, 0.0, 0.0], atol=1e-6)
