@@ -28,7 +28,7 @@ _FARTHEST = 1000.0
 # Others: late: control periods until a command is in force, zero before the first. lost: probability that a command is
 # lost: the one before it is repeated.
 COMMANDS: Mapping[str, float] = MappingProxyType(
-    {"warp": 2.0, "warp_seed": 2.0**32 - 1, "dead_band": 1.0, "backlash": 10.0, "late": 3.0, "lost": 1.0}
+    {"warp": 4.0, "warp_seed": 2.0**32 - 1, "dead_band": 1.0, "backlash": 10.0, "late": 3.0, "lost": 1.0}
 )
 
 
