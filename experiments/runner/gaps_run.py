@@ -110,6 +110,7 @@ def rate(played: Episode, statistic: Callable[..., np.ndarray] = stats.iqm) -> d
 
 def systems(env: Env, reals: Sequence[Gap], priors: list[Prior], episodes: int) -> tuple[Simulated, PyTree]:
     """The real systems of gaps and the parameters of who plays there: members [gaps * priors], all priors on each."""
+    env = real_env(env, reals)
     pools = real_worlds(env, reals, jax.random.key(FINAL_SEED), episodes)
     which = jnp.repeat(jnp.arange(len(reals)), len(priors))
     members = stacking.stack([prior.params for prior in priors] * len(reals))

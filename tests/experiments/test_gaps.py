@@ -2,11 +2,14 @@
 
 import json
 
+import compiled
 import pytest
 from priors_by_hand import save_prior
 
+import envs
 from experiments import gaps
 from experiments.runner import gaps_run
+from sgft_jax.types import Prior
 
 FILES = {
     "turned": "[params]\nmass = 1.0\nfriction = 4.0\n[effects]\naction_rotation = 0.3\n",
@@ -69,6 +72,15 @@ def test_without_training_the_answer_is_open(home, capsys):
 )
 def test_the_limits(zero_shot, trained, answer):
     assert gaps_run.admissible(zero_shot, trained) is answer
+
+
+def test_a_gap_is_measured_in_its_own_scene_and_with_its_errors_of_commands():
+    """`diagnose` plays these systems too, and hands them the simulator."""
+    env = compiled.make("push-towel")
+    towel, late = envs.gaps.load(env, "default"), envs.gaps.from_dict(env, "late", {"commands": {"late": 1}})
+    for gap, scene, errs in ((towel, "towel", False), (late, "", True)):
+        system, _ = gaps_run.systems(env, [gap], [Prior({}, {"gamma": 0.9})], 1)
+        assert system.env.scene == scene and system.env.commands == errs
 
 
 def test_the_settings_of_the_training_are_those_of_the_preset(monkeypatch):
