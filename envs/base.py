@@ -49,6 +49,8 @@ class Parameter(NamedTuple):
     """One domain parameter: its nominal value and the uniform range [low, high] that pretraining draws it from.
 
     minimum, maximum: physical bounds of any value that a user may name (a mass is positive); see `bounds`.
+    real: range in which `sgft_jax.posterior` looks for a real system's value; None = half to twice training's.
+    place: whether every episode draws another value, which sensors show, such as where a hole is.
     """
 
     name: str
@@ -58,6 +60,8 @@ class Parameter(NamedTuple):
     high: float
     minimum: float = -inf
     maximum: float = inf
+    real: tuple[float, float] | None = None
+    place: bool = False
 
     @property
     def bounds(self) -> tuple[float, float]:

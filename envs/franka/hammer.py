@@ -55,16 +55,16 @@ _RED = [0.8, 0.15, 0.1, 1]
 NV = arm.N_JOINTS + 1
 
 PARAMETERS = (
-    Parameter("nail_x", "m", 0.35, 0.30, 0.40, minimum=0.1, maximum=0.8),
-    Parameter("nail_z", "m", 0.60, 0.55, 0.65, minimum=0.1, maximum=1.0),
-    Parameter("nail_damping", "N s/m", 1000.0, 250.0, 2500.0, minimum=0.0),
-    Parameter("nail_half_height", "m", 0.04, 0.02, 0.06, minimum=0.001),
-    Parameter("nail_radius", "m", 0.01, 0.005, 0.015, minimum=0.0005),
-    Parameter("head_radius", "m", 0.035, 0.03, 0.04, minimum=0.0005),
-    Parameter("head_thickness", "m", 0.005, 0.001, 0.01, minimum=0.0001),
-    Parameter("hammer_mass", "kg", 0.05, 0.015, 0.15, minimum=0.001),
-    Parameter("nail_friction", "N", 0.1, 0.1, 0.1, minimum=0.001),
-    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0, minimum=0.01),
+    Parameter("nail_x", "m", 0.35, 0.30, 0.40, minimum=0.1, maximum=0.8, real=(0.25, 0.45), place=True),
+    Parameter("nail_z", "m", 0.60, 0.55, 0.65, minimum=0.1, maximum=1.0, real=(0.48, 0.69), place=True),
+    Parameter("nail_damping", "N s/m", 1000.0, 250.0, 2500.0, minimum=0.0, real=(200.0, 6000.0)),
+    Parameter("nail_half_height", "m", 0.04, 0.02, 0.06, minimum=0.001, real=(0.012, 0.08), place=True),
+    Parameter("nail_radius", "m", 0.01, 0.005, 0.015, minimum=0.0005, real=(0.002, 0.017)),
+    Parameter("head_radius", "m", 0.035, 0.03, 0.04, minimum=0.0005, real=(0.012, 0.05)),
+    Parameter("head_thickness", "m", 0.005, 0.001, 0.01, minimum=0.0001, real=(0.0004, 0.017)),
+    Parameter("hammer_mass", "kg", 0.05, 0.015, 0.15, minimum=0.001, real=(0.008, 0.6)),
+    Parameter("nail_friction", "N", 0.1, 0.1, 0.1, minimum=0.001, real=(0.1, 200.0)),
+    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0, minimum=0.01, real=(0.2, 2.5)),
 )
 _INDEX = {p.name: i for i, p in enumerate(PARAMETERS)}
 

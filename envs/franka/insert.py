@@ -55,13 +55,13 @@ Q_READY = np.array([0.0, 0.2, 0.0, -2.39, 0.0, 2.6, np.pi / 4])
 NV = arm.N_JOINTS
 
 PARAMETERS = (
-    Parameter("part_x", "m", 0.0, -0.05, 0.05, minimum=-0.15, maximum=0.15),
-    Parameter("part_y", "m", 0.0, -0.05, 0.05, minimum=-0.15, maximum=0.15),
-    Parameter("part_rotation", "rad", 0.0, -np.pi / 12, np.pi / 12, minimum=-np.pi, maximum=np.pi),
-    Parameter("part_friction", "", 0.15, 0.14, 0.16, minimum=0.0),
-    Parameter("hole_radius", "m", 0.012, 0.012, 0.012, minimum=0.001, maximum=0.05),
-    Parameter("peg_radius", "m", 0.0115, 0.0115, 0.0115, minimum=0.001, maximum=LEG_HALF_WIDTH),
-    Parameter("servo_stiffness", "", 0.5, 0.5, 0.5, minimum=0.01),
+    Parameter("part_x", "m", 0.0, -0.05, 0.05, minimum=-0.15, maximum=0.15, real=(-0.06, 0.06), place=True),
+    Parameter("part_y", "m", 0.0, -0.05, 0.05, minimum=-0.15, maximum=0.15, real=(-0.06, 0.06), place=True),
+    Parameter("part_rotation", "rad", 0.0, -np.pi / 12, np.pi / 12, minimum=-np.pi, maximum=np.pi, real=(-0.6, 0.6)),
+    Parameter("part_friction", "", 0.15, 0.14, 0.16, minimum=0.0, real=(0.04, 0.5)),
+    Parameter("hole_radius", "m", 0.012, 0.012, 0.012, minimum=0.001, maximum=0.05, real=(0.0116, 0.0126)),
+    Parameter("peg_radius", "m", 0.0115, 0.0115, 0.0115, minimum=0.001, maximum=LEG_HALF_WIDTH, real=(0.011, 0.0119)),
+    Parameter("servo_stiffness", "", 0.5, 0.5, 0.5, minimum=0.01, real=(0.2, 2.0)),
 )
 
 

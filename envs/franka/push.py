@@ -48,12 +48,12 @@ Q_FOLDED = np.array([0.0, 0.247, 0.0, -2.966, 0.0, 3.213, np.pi / 4])
 NV = arm.N_JOINTS + 4  # puck: x, y, z, yaw
 
 PARAMETERS = (
-    Parameter("object_x", "m", 0.22, 0.15, 0.30, minimum=0.0, maximum=EDGE),
-    Parameter("object_y", "m", 0.0, -0.25, 0.25, minimum=-TABLE_HALF_WIDTH, maximum=TABLE_HALF_WIDTH),
-    Parameter("object_mass", "kg", 0.15, 0.15, 0.15, minimum=0.001),
-    Parameter("table_friction", "", 0.35, 0.35, 0.35, minimum=0.0),
-    Parameter("finger_friction", "", 0.5, 0.5, 0.5, minimum=0.0),
-    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0, minimum=0.01),
+    Parameter("object_x", "m", 0.22, 0.15, 0.30, minimum=0.0, maximum=EDGE, place=True),
+    Parameter("object_y", "m", 0.0, -0.25, 0.25, minimum=-TABLE_HALF_WIDTH, maximum=TABLE_HALF_WIDTH, place=True),
+    Parameter("object_mass", "kg", 0.15, 0.15, 0.15, minimum=0.001, real=(0.04, 0.6)),
+    Parameter("table_friction", "", 0.35, 0.35, 0.35, minimum=0.0, real=(0.08, 0.7)),
+    Parameter("finger_friction", "", 0.5, 0.5, 0.5, minimum=0.0, real=(0.08, 1.2)),
+    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0, minimum=0.01, real=(0.25, 2.5)),
 )
 
 

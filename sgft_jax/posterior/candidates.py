@@ -1,0 +1,132 @@
+"""What is not known of a real system, and the simulated systems that may be it. Pure, but for `candidates`.
+
+A candidate is a point [d] of the unit cube, over which the prior is uniform: one number for each unknown.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import EffectRange, Effects, Env, Parameter, Theta, World
+from envs.effects import make_range
+from envs.patches import patches
+from envs.types import Array, Key
+
+_SCALE, _BIAS, _TURN = (0.35, 1.7), (-0.6, 0.6), (-1.0, 1.0)  # of commands; of their range [-1, 1]; rad
+_LATENCY = 0.6  # control periods at most
+_ERRORS = 2.5  # a constant error is at most so many of an entry's `error`
+_NOISE = (0.3, 2.5)  # of the noise that training has
+_WIDE = 3.0  # from low to high: from here on a number's logarithm is uniform
+
+
+class Unknown(NamedTuple):
+    """A number of a real system: of a domain parameter or an effect, at `index` where that is a vector.
+
+    low, high: raw units.
+    """
+
+    name: str
+    index: int
+    low: float
+    high: float
+
+    @property
+    def log(self) -> bool:
+        """Whether its logarithm is uniform instead of the number itself."""
+        return self.low > 0 and self.high >= _WIDE * self.low
+
+
+class Candidates(NamedTuple):
+    """Simulated systems of a task, at points [d] of the unit cube.
+
+    world(point [d], place [k]) -> World. place: [k] domain parameters that every episode draws anew, within low, high
+    [k] where rollouts are explained, and within the training ranges training_low, training_high [k] in simulation.
+    """
+
+    unknowns: tuple[Unknown, ...]
+    world: Callable[[Array, Array], World]
+    low: Array
+    high: Array
+    training_low: Array
+    training_high: Array
+
+    def draw(self, key: Key, n: int) -> Array:
+        """[n, d] points from the prior."""
+        return jax.random.uniform(key, (n, len(self.unknowns)))
+
+    def episode(self, point: Array, key: Key) -> World:
+        """Where a simulated episode of a candidate takes place."""
+        share = jax.random.uniform(key, self.low.shape)
+        return self.world(point, self.training_low + (self.training_high - self.training_low) * share)
+
+
+def values(unknowns: tuple[Unknown, ...], point: Array) -> Array:
+    """[d] raw units at a point [d]."""
+    log = np.array([u.log for u in unknowns])
+    ends = (np.array([getattr(u, end) for u in unknowns]) for end in ("low", "high"))
+    low, high = (np.where(log, np.log(np.where(log, end, 1.0)), end) for end in ends)
+    numbers = low + (high - low) * point
+    return jnp.where(log, jnp.exp(numbers), numbers)
+
+
+def unknowns_of(env: Env) -> tuple[Unknown, ...]:
+    """Every unknown of a task, by the same rule for all tasks.
+
+    Domain parameters but for places; of commands scale, constant bias, rotation (Cartesian ones) and latency; constant
+    errors of the measurements that may have one; the noise of sensors. Nothing else: what no unknown explains is what
+    a misfit shows.
+    """
+    unknowns = [Unknown(p.name, 0, *real_range(p)) for p in env.parameters if not p.place]
+    unknowns += [Unknown("action_scale", i, *_SCALE) for i in range(env.act_dim)]
+    unknowns += [Unknown("action_bias", i, *_BIAS) for i in range(env.act_dim)]
+    unknowns += [Unknown("action_rotation", 0, *_TURN)] if env.cartesian else []
+    unknowns += [Unknown("latency", 0, 0.0, _LATENCY * env.control_dt)]
+    unknowns += [Unknown("obs_bias", i, -_ERRORS * e, _ERRORS * e) for i, e in enumerate(env.sensor_errors)]
+    noise = _training_noise(env)
+    unknowns += [Unknown("obs_noise", 0, noise * _NOISE[0], noise * _NOISE[1])]
+    return tuple(unknown for unknown in unknowns if unknown.low < unknown.high)
+
+
+def real_range(parameter: Parameter) -> tuple[float, float]:
+    """Where the value of a real system is looked for."""
+    if parameter.real is not None:
+        return parameter.real
+    low, high, (least, most) = parameter.low, parameter.high, parameter.bounds
+    if low > 0:
+        return max(low / 2, least), min(2 * high, most)
+    return max(low - (high - low) / 2, least), min(high + (high - low) / 2, most)
+
+
+def candidates(env: Env) -> Candidates:
+    """Simulated systems of a task, patched on the device. Impure: MuJoCo compiles a few hundred worlds, in seconds."""
+    ranges = np.array([real_range(p) for p in env.parameters]).reshape(-1, 2)
+    model = patches(env, ranges).model
+    unknowns, names = unknowns_of(env), [p.name for p in env.parameters]
+    nothing = make_range(env, {"obs_noise_prob": 1.0, "obs_noise": _training_noise(env)}).low
+    nominal = jnp.array([p.nominal for p in env.parameters])
+    where = np.array([i for i, p in enumerate(env.parameters) if p.place], int)
+    training = np.array([(p.low, p.high) for p in env.parameters]).reshape(-1, 2)
+
+    def world(point: Array, place: Array) -> World:
+        params, effects = nominal.at[where].set(place), nothing._asdict()
+        for unknown, value in zip(unknowns, values(unknowns, point), strict=True):
+            if unknown.name in Effects._fields:
+                old = effects[unknown.name]
+                effects[unknown.name] = old.at[unknown.index].set(value) if old.ndim else value
+            else:
+                params = params.at[names.index(unknown.name)].set(value)
+        exactly = Effects(**effects)
+        return World(Theta(params, EffectRange(exactly, exactly)), model(params))
+
+    ends = (*ranges[where].T, *training[where].T)
+    return Candidates(unknowns, world, *(jnp.asarray(end, jnp.float32) for end in ends))
+
+
+def _training_noise(env: Env) -> float:
+    """Root mean square of the noise that the simulator's own sensors have, raw units."""
+    high = make_range(env, env.training).high
+    return float(high.obs_noise * math.sqrt(high.obs_noise_prob))
