@@ -45,6 +45,7 @@ class Candidates(NamedTuple):
 
     world(point [d], place [k]) -> World. place: [k] domain parameters that every episode draws anew, within low, high
     [k] where rollouts are explained, and within the training ranges training_low, training_high [k] in simulation.
+    noise: root mean square of the noise of the simulator's sensors, raw units.
     """
 
     unknowns: tuple[Unknown, ...]
@@ -53,6 +54,7 @@ class Candidates(NamedTuple):
     high: Array
     training_low: Array
     training_high: Array
+    noise: float
 
     def draw(self, key: Key, n: int) -> Array:
         """[n, d] points from the prior."""
@@ -123,7 +125,7 @@ def candidates(env: Env) -> Candidates:
         return World(Theta(params, EffectRange(exactly, exactly)), model(params))
 
     ends = (*ranges[where].T, *training[where].T)
-    return Candidates(unknowns, world, *(jnp.asarray(end, jnp.float32) for end in ends))
+    return Candidates(unknowns, world, *(jnp.asarray(end, jnp.float32) for end in ends), _training_noise(env))
 
 
 def _training_noise(env: Env) -> float:

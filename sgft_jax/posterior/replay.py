@@ -6,6 +6,7 @@ says which of them go on. At every step half of them follow the command exactly,
 others follow it with a jolt of random size, so that contact does not lose them all.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -17,10 +18,13 @@ from envs.base import Env, EnvState, World
 from envs.rollout import Episode
 from envs.types import Array, Key, UserError
 from sgft_jax.posterior.candidates import Candidates
+from sgft_jax.posterior.smc import Likelihood, systematic
 
 _FREEDOM = 4.0  # of Student's t, which forgives a measurement that is far off
 _EXPLODED = -1e4  # nats
 _LEAST = 1e-4  # raw units: a sensor's noise is at least this
+_USUAL = 1.46  # nats, minus the mean log density, per number, of Student's t where noise is normal
+_LOST = 15.0  # nats, the most that one step can cost where all states have lost the rollout
 _STEP = 0.05  # of a place's range, between which its measurements are taken to be linear
 _EXACT = 0.5  # of the states
 _JOLTS = 0.01, 0.3  # std of the least and the largest, in units of the command's range; their logarithm is uniform
@@ -65,6 +69,7 @@ def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key
     key_start, key_steps = jax.random.split(key)
     worlds, start = _starts(env, candidates, point, rollout.measured[0], key_start, states)
     noise, bias = _noise(start)[0], start.effects.obs_bias[0]
+    floor = -env.measured_dim * (math.log(max(candidates.noise, _LEAST)) + _USUAL) - _LOST
 
     def weigh(state: EnvState, measured: Array) -> Array:
         """[] nats of one state."""
@@ -79,14 +84,26 @@ def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key
         keys = jax.random.split(key_step, states)
         after = jax.vmap(env.step, (0, 0, None, 0))(here, _jolted(before, key_jolt), action, keys)
         log_weights = jax.vmap(weigh, (0, None))(after, measured)
-        chosen = _resampled(key_choice, log_weights)
+        chosen = systematic(key_choice, log_weights)
         moved = jax.tree.map(lambda x: x[chosen], (which, after))
         carry = jax.tree.map(lambda new, old: jnp.where(valid, new, old), moved, carry)
-        return carry, jnp.where(valid, jax.nn.logsumexp(log_weights) - jnp.log(states), 0.0)
+        density = jnp.logaddexp(jax.nn.logsumexp(log_weights) - jnp.log(states), floor)
+        return carry, jnp.where(valid, density, 0.0)
 
     rows = rollout.action, rollout.measured[1:], rollout.valid, jax.random.split(key_steps, len(rollout.valid))
     (_, last), log_likelihood = jax.lax.scan(step, (jnp.arange(states), start), rows)
     return Evidence(log_likelihood, (last.success & ~last.invalid).mean())
+
+
+def likelihood(env: Env, candidates: Candidates, rollouts: Rollout, *, states: int = 8) -> Likelihood:
+    """Of rollouts [k] together, for many candidates."""
+
+    def of_one(point: Array, key: Key) -> Array:
+        keys = jax.random.split(key, len(rollouts.success))
+        explain = functools.partial(replay, env, candidates, point, states=states)
+        return jax.vmap(explain)(rollouts, keys).log_likelihood.sum()
+
+    return jax.vmap(of_one)
 
 
 def _jolted(state: EnvState, key: Key) -> EnvState:
@@ -155,10 +172,3 @@ def _log_density(x: Array) -> Array:
     half = 0.5 * (_FREEDOM + 1.0)
     constant = math.lgamma(half) - math.lgamma(0.5 * _FREEDOM) - 0.5 * math.log(_FREEDOM * math.pi)
     return constant - half * jnp.log1p(x**2 / _FREEDOM)
-
-
-def _resampled(key: Key, log_weights: Array) -> Array:
-    """[n] indices, each as often as its weight [n] says, up to one (systematic resampling)."""
-    n = len(log_weights)
-    ends = jnp.cumsum(jax.nn.softmax(log_weights))
-    return jnp.clip(jnp.searchsorted(ends, (jnp.arange(n) + jax.random.uniform(key)) / n), 0, n - 1)
