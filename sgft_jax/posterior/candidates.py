@@ -19,7 +19,7 @@ from envs.types import Array, Key
 _SCALE, _BIAS, _TURN = (0.35, 1.7), (-0.6, 0.6), (-1.0, 1.0)  # of commands; of their range [-1, 1]; rad
 _LATENCY = 0.6  # control periods at most
 _ERRORS = 2.5  # a constant error is at most so many of an entry's `error`
-_NOISE = (0.3, 2.5)  # of the noise that training has
+_NOISE = 2.0  # times the noise that training has: a level to be found would grow to excuse wrong systems
 _WIDE = 3.0  # from low to high: from here on a number's logarithm is uniform
 
 
@@ -45,7 +45,6 @@ class Candidates(NamedTuple):
 
     world(point [d], place [k]) -> World. place: [k] domain parameters that every episode draws anew, within low, high
     [k] where rollouts are explained, and within the training ranges training_low, training_high [k] in simulation.
-    noise: root mean square of the noise of the simulator's sensors, raw units.
     """
 
     unknowns: tuple[Unknown, ...]
@@ -54,7 +53,6 @@ class Candidates(NamedTuple):
     high: Array
     training_low: Array
     training_high: Array
-    noise: float
 
     def draw(self, key: Key, n: int) -> Array:
         """[n, d] points from the prior."""
@@ -79,7 +77,7 @@ def unknowns_of(env: Env) -> tuple[Unknown, ...]:
     """Every unknown of a task, by the same rule for all tasks.
 
     Domain parameters but for places; of commands scale, constant bias, rotation (Cartesian ones) and latency; constant
-    errors of the measurements that may have one; the noise of sensors. Nothing else: what no unknown explains is what
+    errors of the measurements that may have one. Nothing else: what no unknown explains is what
     a misfit shows.
     """
     unknowns = [Unknown(p.name, 0, *real_range(p)) for p in env.parameters if not p.place]
@@ -88,8 +86,6 @@ def unknowns_of(env: Env) -> tuple[Unknown, ...]:
     unknowns += [Unknown("action_rotation", 0, *_TURN)] if env.cartesian else []
     unknowns += [Unknown("latency", 0, 0.0, _LATENCY * env.control_dt)]
     unknowns += [Unknown("obs_bias", i, -_ERRORS * e, _ERRORS * e) for i, e in enumerate(env.sensor_errors)]
-    noise = _training_noise(env)
-    unknowns += [Unknown("obs_noise", 0, noise * _NOISE[0], noise * _NOISE[1])]
     return tuple(unknown for unknown in unknowns if unknown.low < unknown.high)
 
 
@@ -108,7 +104,7 @@ def candidates(env: Env) -> Candidates:
     ranges = np.array([real_range(p) for p in env.parameters]).reshape(-1, 2)
     model = patches(env, ranges).model
     unknowns, names = unknowns_of(env), [p.name for p in env.parameters]
-    nothing = make_range(env, {"obs_noise_prob": 1.0, "obs_noise": _training_noise(env)}).low
+    nothing = make_range(env, {"obs_noise_prob": 1.0, "obs_noise": _noise(env)}).low
     nominal = jnp.array([p.nominal for p in env.parameters])
     where = np.array([i for i, p in enumerate(env.parameters) if p.place], int)
     training = np.array([(p.low, p.high) for p in env.parameters]).reshape(-1, 2)
@@ -125,10 +121,10 @@ def candidates(env: Env) -> Candidates:
         return World(Theta(params, EffectRange(exactly, exactly)), model(params))
 
     ends = (*ranges[where].T, *training[where].T)
-    return Candidates(unknowns, world, *(jnp.asarray(end, jnp.float32) for end in ends), _training_noise(env))
+    return Candidates(unknowns, world, *(jnp.asarray(end, jnp.float32) for end in ends))
 
 
-def _training_noise(env: Env) -> float:
-    """Root mean square of the noise that the simulator's own sensors have, raw units."""
+def _noise(env: Env) -> float:
+    """Std of measurements that candidates are allowed, raw units."""
     high = make_range(env, env.training).high
-    return float(high.obs_noise * math.sqrt(high.obs_noise_prob))
+    return _NOISE * float(high.obs_noise * math.sqrt(high.obs_noise_prob))

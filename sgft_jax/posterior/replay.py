@@ -23,8 +23,6 @@ from sgft_jax.posterior.smc import Likelihood, systematic
 _FREEDOM = 4.0  # of Student's t, which forgives a measurement that is far off
 _EXPLODED = -1e4  # nats
 _LEAST = 1e-4  # raw units: a sensor's noise is at least this
-_USUAL = 1.46  # nats, minus the mean log density, per number, of Student's t where noise is normal
-_LOST = 15.0  # nats, the most that one step can cost where all states have lost the rollout
 _STEP = 0.05  # of a place's range, between which its measurements are taken to be linear
 _EXACT = 0.5  # of the states
 _JOLTS = 0.01, 0.3  # std of the least and the largest, in units of the command's range; their logarithm is uniform
@@ -69,7 +67,6 @@ def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key
     key_start, key_steps = jax.random.split(key)
     worlds, start = _starts(env, candidates, point, rollout.measured[0], key_start, states)
     noise, bias = _noise(start)[0], start.effects.obs_bias[0]
-    floor = -env.measured_dim * (math.log(max(candidates.noise, _LEAST)) + _USUAL) - _LOST
 
     def weigh(state: EnvState, measured: Array) -> Array:
         """[] nats of one state."""
@@ -87,8 +84,7 @@ def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key
         chosen = systematic(key_choice, log_weights)
         moved = jax.tree.map(lambda x: x[chosen], (which, after))
         carry = jax.tree.map(lambda new, old: jnp.where(valid, new, old), moved, carry)
-        density = jnp.logaddexp(jax.nn.logsumexp(log_weights) - jnp.log(states), floor)
-        return carry, jnp.where(valid, density, 0.0)
+        return carry, jnp.where(valid, jax.nn.logsumexp(log_weights) - jnp.log(states), 0.0)
 
     rows = rollout.action, rollout.measured[1:], rollout.valid, jax.random.split(key_steps, len(rollout.valid))
     (_, last), log_likelihood = jax.lax.scan(step, (jnp.arange(states), start), rows)

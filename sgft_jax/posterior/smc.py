@@ -15,12 +15,12 @@ import jax.numpy as jnp
 
 from envs.types import Array, Key
 
-_MOVES = 3  # of each particle in a stage
+_MOVES = 5  # of each particle in a stage
 _STAGES = 40  # at most
 _SPREAD = 2.38  # over the root of twice the dimension: the best step of differences in a Gaussian
 _JUMP = 0.1  # share of moves by a whole difference, from mode to mode
 _NUDGE = 1e-3  # std of what is added to a difference, so that no coordinate dies out
-_RATES = 0.15, 0.4  # acceptance, below and above which steps get shorter and longer
+_RATE, _ADAPT = 0.25, 2.0  # the acceptance that steps are made for, and how fast their logarithm follows
 _HALVINGS = 30  # of the search for the next exponent
 
 Likelihood = Callable[[Array, Key], Array]  # (points [n, d], keys [n]) -> [n] estimated nats
@@ -107,28 +107,27 @@ def _moved(likelihood: Likelihood, particles: Particles, key: Key) -> Particles:
     """Particles after a stage's moves, which leave their distribution as it is."""
     n, d = particles.points.shape
 
-    def move(carry: tuple[Array, Array], key: Key) -> tuple[tuple[Array, Array], Array]:
-        points, log_likelihood = carry
+    def move(before: Particles, key: Key) -> tuple[Particles, Array]:
         key_pairs, key_nudge, key_jump, key_estimate, key_accept = jax.random.split(key, 5)
         # Two others of each particle: shifts of the ring by two different numbers, the same for all.
         shifts = 1 + jax.random.choice(key_pairs, n - 1, (2,), replace=False)
-        difference = jnp.roll(points, shifts[0], axis=0) - jnp.roll(points, shifts[1], axis=0)
+        difference = jnp.roll(before.points, shifts[0], axis=0) - jnp.roll(before.points, shifts[1], axis=0)
         jump = jax.random.uniform(key_jump, (n, 1)) < _JUMP
-        step = jnp.where(jump, 1.0, particles.scale * _SPREAD / jnp.sqrt(2.0 * d)) * difference
-        proposed = _reflected(points + step + _NUDGE * jax.random.normal(key_nudge, (n, d)))
+        step = jnp.where(jump, 1.0, before.scale * _SPREAD / jnp.sqrt(2.0 * d)) * difference
+        proposed = _reflected(before.points + step + _NUDGE * jax.random.normal(key_nudge, (n, d)))
         estimate = likelihood(proposed, jax.random.split(key_estimate, n))
-        gain = particles.exponent * (estimate - log_likelihood)
+        gain = before.exponent * (estimate - before.log_likelihood)
         accepted = jnp.log(jax.random.uniform(key_accept, (n,))) < gain
-        points = jnp.where(accepted[:, None], proposed, points)
-        return (points, jnp.where(accepted, estimate, log_likelihood)), accepted.mean()
+        rate = accepted.mean()
+        after = before._replace(
+            points=jnp.where(accepted[:, None], proposed, before.points),
+            log_likelihood=jnp.where(accepted, estimate, before.log_likelihood),
+            scale=before.scale * jnp.exp(_ADAPT * (rate - _RATE)),
+        )
+        return after, rate
 
-    (points, kept), rates = jax.lax.scan(
-        move, (particles.points, particles.log_likelihood), jax.random.split(key, _MOVES)
-    )
-    rate, (low, high) = rates.mean(), _RATES
-    scale = particles.scale * jnp.where(rate < low, 0.6, jnp.where(rate > high, 1.4, 1.0))
-    stages = particles.stages + 1
-    return particles._replace(points=points, log_likelihood=kept, acceptance=rate, stages=stages, scale=scale)
+    after, rates = jax.lax.scan(move, particles, jax.random.split(key, _MOVES))
+    return after._replace(acceptance=rates.mean(), stages=particles.stages + 1)
 
 
 def _reflected(points: Array) -> Array:

@@ -37,7 +37,7 @@ def played(there, key, env=TOY, steps=20):
 
 def candidates(world, low=NOWHERE, high=NOWHERE):
     """Systems of one place parameter at most, and no other."""
-    return Candidates((), lambda point, place: world(place), low, high, low, high, NOISE)
+    return Candidates((), lambda point, place: world(place), low, high, low, high)
 
 
 def evidence(rollout, there, key, **options):
