@@ -109,7 +109,8 @@ def _set_up(args: PosteriorArgs, task: str, count: int) -> Setup:
     prior = load_prior(f"shipped:{task}/seed-0")
     env, simulator = make_env(prior), envs.make(task, choose_impl(args.impl))
     policy = make_policy(prior.card, env)
-    with doing(f"compiling worlds of {task}", 10):
+    with doing(f"compiling the simulator and worlds of {task}", 40, once=True):
+        simulator.prepare()
         systems = candidates(simulator)
     key_systems, key_play = jax.random.split(jax.random.key(args.seed))
     true = systems.draw(key_systems, args.systems)
