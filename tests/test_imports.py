@@ -66,8 +66,8 @@ ORDER = {
         *("gap_distribution", "checks", "mujoco", "control", "franka", "locomotion", "", "rollout", "adapters"),
     ),
     "sgft_jax": (
-        *("types", "keys", "checks", "stacking", "files", "math", "models", "data", "planning", "learners"),
-        *("policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
+        *("types", "keys", "checks", "stacking", "files", "math", "models", "posterior", "data", "planning"),
+        *("learners", "policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
         *("datasets", "systems", "train"),
         *("examination", "methods", "analysis", "api", ""),
     ),
