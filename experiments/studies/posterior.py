@@ -21,7 +21,7 @@ import envs
 from envs.base import Env, World
 from envs.mujoco.worlds import choose_impl
 from envs.rollout import Episode, play_episode
-from envs.types import Array, Key, PyTree, UserError
+from envs.types import Array, Key, PyTree
 from experiments.runner import cli
 from experiments.runner.cli import Json
 from experiments.runner.options import Impl, Out, at_least_one, each_once, seed_list
@@ -36,7 +36,6 @@ from sgft_jax.posterior.replay import Rollout, likelihood, replay, rollout_of
 from sgft_jax.posterior.smc import Particles, begin, sample
 
 _BEATEN, _SYSTEMS = 0.9, 0.8  # gate 1: the truth beats so many draws, on so many systems
-_MOST = 100  # rollouts in memory
 EXPONENTS = (0.01, 0.02, 0.05, 0.1, 0.2)
 _CANDIDATES, _JUDGES = 24, 32  # particles whose corrections are tried, and particles that they are tried in
 _EPISODES, _PLAYED = 4, 50  # of a candidate in a particle, and of the chosen one in the true system
@@ -84,11 +83,9 @@ class Setup(NamedTuple):
 
 def main(args: PosteriorArgs) -> None:
     """Measures, prints and writes the numbers to <out>/posterior/summary.json."""
-    at_least_one(args, "systems", "draws", "particles", "states")
+    at_least_one(args, "systems", "rollouts", "draws", "particles", "states")
     each_once(args, "parts", "tasks", "rollouts")
     seed_list(args.seed, 1)
-    if wrong := [count for count in args.rollouts if not 1 <= count <= _MOST]:
-        raise UserError(f"--rollouts {wrong[0]}: must be from 1 to {_MOST}")
     folder = args.out / "posterior"
     summary: dict[str, Any] = {part: [] for part in args.parts}
     for task in args.tasks:
