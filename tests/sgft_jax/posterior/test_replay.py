@@ -78,6 +78,7 @@ def test_steps_that_are_not_valid_count_nothing(key):
     np.testing.assert_array_equal(part[7:], 0.0)
 
 
+@pytest.mark.heavy
 def test_more_states_err_less(key):
     rollout = played(world(), key)
 
@@ -116,6 +117,7 @@ def showing(env):
     )
 
 
+@pytest.mark.heavy
 def test_what_an_episode_draws_is_taken_from_its_first_measurement(key):
     """A friction of 0.7 is seen as 0.8 by a camera that errs by 0.1: whoever knows the error knows the friction."""
     env = showing(TOY)

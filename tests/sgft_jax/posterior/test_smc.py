@@ -53,6 +53,7 @@ def test_a_posterior_goes_on_from_a_wider_one(key):
     assert narrow.stages > wide.stages
 
 
+@pytest.mark.heavy
 def test_both_modes_stay(key):
     def likelihood(points, keys):
         return jnp.logaddexp(*(-0.5 * (((points - x) / 0.03) ** 2).sum(axis=1) for x in (0.2, 0.8)))
