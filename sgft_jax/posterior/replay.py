@@ -20,7 +20,9 @@ from envs.types import Array, Key, UserError
 from sgft_jax.posterior.candidates import Candidates
 from sgft_jax.posterior.smc import Likelihood, systematic
 
-_FREEDOM = 4.0  # of Student's t, which forgives a measurement that is far off
+# Of Student's t, which forgives a measurement that is far off, and still tells far from farther: with a floor under a
+# step's likelihood nearly all systems were equally bad, and nothing led to the true one.
+_FREEDOM = 4.0
 _EXPLODED = -1e4  # nats
 _LEAST = 1e-4  # raw units: a sensor's noise is at least this
 _STEP = 0.05  # of a place's range, between which its measurements are taken to be linear
