@@ -8,7 +8,9 @@ chosen under them promises and does; beside it, what is chosen without data.
 
 import functools
 import json
+import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -28,12 +30,13 @@ from experiments.runner.options import Impl, Out, at_least_one, each_once, seed_
 from experiments.runner.progress import doing
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
-from sgft_jax.api import load_prior, make_env
 from sgft_jax.io.log import write_summary
+from sgft_jax.io.priors import load_prior, observed
+from sgft_jax.models.distortion import none
 from sgft_jax.posterior.candidates import Candidates, candidates
 from sgft_jax.posterior.decision import Decision, correction, decide
 from sgft_jax.posterior.replay import Rollout, likelihood, replay, rollout_of
-from sgft_jax.posterior.smc import Particles, begin, sample
+from sgft_jax.posterior.smc import Likelihood, Particles, begin, sample
 
 _BEATEN, _SYSTEMS = 0.9, 0.8  # gate 1: the truth beats so many draws, on so many systems
 EXPONENTS = (0.01, 0.02, 0.05, 0.1, 0.2)
@@ -76,7 +79,7 @@ class Setup(NamedTuple):
     env: Env
     simulator: Env
     systems: Candidates
-    play: Any
+    play: Callable[[PyTree, World, Key], Episode]
     true: Array
     rollouts: Rollout
 
@@ -107,7 +110,8 @@ def main(args: PosteriorArgs) -> None:
 def _set_up(args: PosteriorArgs, task: str, count: int) -> Setup:
     """The task, its systems and what is played in them."""
     prior = load_prior(f"shipped:{task}/seed-0")
-    env, simulator = make_env(prior), envs.make(task, choose_impl(args.impl))
+    impl = choose_impl(args.impl)
+    env, simulator = envs.make(task, impl, **observed(prior.card)), envs.make(task, impl)
     policy = make_policy(prior.card, env)
     with doing(f"compiling the simulator and worlds of {task}", 40, once=True):
         simulator.prepare()
@@ -174,7 +178,7 @@ def _calibrate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
     keys = jax.random.split(jax.random.key(args.seed + 2), args.systems)
     points = jax.vmap(lambda key: setup.systems.draw(key, args.particles))(keys)
 
-    def explain(rollouts: Rollout) -> Any:
+    def explain(rollouts: Rollout) -> Likelihood:
         return likelihood(setup.simulator, setup.systems, rollouts, states=args.states)
 
     first = jax.jit(jax.vmap(lambda rollouts, points, key: begin(explain(rollouts), points, key)))
@@ -191,9 +195,10 @@ def _calibrate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
                 particles = further(setup.rollouts, particles, keys, jnp.float32(exponent))
                 particles = jax.block_until_ready(particles)
         seconds = time.perf_counter() - begun
-        decision, played = jax.device_get(judged(particles.points, setup.true, keys))
+        with doing("playing in particles what may be deployed", 30, once=True):
+            decision, played = jax.device_get(judged(particles.points, setup.true, keys))
         lines.append(_line(setup, particles, decision, played, exponent, seconds))
-        print(_table(lines[-1:]), flush=True)
+        print(_table(lines[-1:]), file=sys.stderr, flush=True)
         begun = time.perf_counter()
     return lines
 
@@ -203,9 +208,8 @@ def _decide(setup: Setup, points: Array, true: Array, key: Key) -> tuple[Decisio
     key_decide, key_played = jax.random.split(key)
     undo = jax.vmap(lambda point: correction(setup.env, setup.systems.unknowns, point))
     tried = undo(points[:_CANDIDATES])
-    nothing = jax.tree.map(lambda x: jnp.zeros_like(x[:1]), tried)
-    nothing = nothing._replace(matrix=jnp.eye(setup.env.act_dim)[None])
-    acting = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), nothing, tried)
+    nothing = none(setup.env.act_dim, setup.env.measured_dim)
+    acting = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), nothing, tried)
 
     def success(distortion: PyTree, world: World, key: Key) -> Array:
         return setup.play(distortion, world, key).success
