@@ -13,8 +13,18 @@ def test_both_parts_on_push(tmp_path, monkeypatch, capsys):
     sizes = {"_CANDIDATES": 3, "_JUDGES": 2, "_EPISODES": 1, "_PLAYED": 2, "EXPONENTS": (0.001, 0.002)}
     for name, value in sizes.items():
         monkeypatch.setattr(posterior, name, value)
-    small = dict(systems=2, rollouts=(1,), draws=20, particles=8, states=4, impl="c")
-    args = posterior.PosteriorArgs(parts=("gate", "calibrate"), tasks=("push",), out=tmp_path, json=True, **small)
+    args = posterior.PosteriorArgs(
+        parts=("gate", "calibrate"),
+        tasks=("push",),
+        systems=2,
+        rollouts=(1,),
+        draws=20,
+        particles=8,
+        states=4,
+        impl="c",
+        json=True,
+        out=tmp_path,
+    )
     posterior.main(args)
     summary = json.loads((tmp_path / "posterior/summary.json").read_text())
     assert json.loads(capsys.readouterr().out) == summary

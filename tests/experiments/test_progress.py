@@ -186,6 +186,14 @@ def test_the_phases_of_every_command():
         "hybrid_run": {"building the worlds"},
         "kept": {"collecting ... simulated transitions of the priors"},
         "pictures": {"rendering a video"},
+        "posterior": {
+            "compiling the simulator and worlds of ...",
+            "playing ... rollouts",
+            "replaying in ... systems",
+            "replaying in the systems of the prior",
+            "sampling the posterior with exponent ...",
+            "playing in particles what may be deployed",
+        },
         "pretrain_run": {
             "building ... worlds",
             "collecting ... random transitions",
