@@ -19,7 +19,6 @@ from envs.types import Array, Key
 _SCALE, _BIAS, _TURN = (0.35, 1.7), (-0.6, 0.6), (-1.0, 1.0)  # of commands; of their range [-1, 1]; rad
 _LATENCY = 0.6  # control periods at most
 _ERRORS = 2.5  # a constant error is at most so many of an entry's `error`
-_NOISE = 2.0  # times the noise that training has: a level to be found would grow to excuse wrong systems
 _WIDE = 3.0  # from low to high: from here on a number's logarithm is uniform
 
 
@@ -77,8 +76,8 @@ def unknowns_of(env: Env) -> tuple[Unknown, ...]:
     """Every unknown of a task, by the same rule for all tasks.
 
     Domain parameters but for places; of commands scale, constant bias, rotation (Cartesian ones) and latency; constant
-    errors of the measurements that may have one. Nothing else: what no unknown explains is what
-    a misfit shows.
+    errors of the measurements that may have one. Not the noise of sensors, which is training's: a level to be found
+    would grow to excuse wrong systems. Nothing else: what no unknown explains is what a misfit shows.
     """
     unknowns = [Unknown(p.name, 0, *real_range(p)) for p in env.parameters if not p.place]
     unknowns += [Unknown("action_scale", i, *_SCALE) for i in range(env.act_dim)]
@@ -125,6 +124,6 @@ def candidates(env: Env) -> Candidates:
 
 
 def _noise(env: Env) -> float:
-    """Std of measurements that candidates are allowed, raw units."""
+    """Root mean square of the noise of training's sensors, raw units."""
     high = make_range(env, env.training).high
-    return _NOISE * float(high.obs_noise * math.sqrt(high.obs_noise_prob))
+    return float(high.obs_noise * math.sqrt(high.obs_noise_prob))

@@ -23,6 +23,7 @@ from sgft_jax.posterior.smc import Likelihood, systematic
 # Of Student's t, which forgives a measurement that is far off, and still tells far from farther: with a floor under a
 # step's likelihood nearly all systems were equally bad, and nothing led to the true one.
 _FREEDOM = 4.0
+_ALLOWED = 2.0  # times the simulator's noise: real sensors may be noisier
 _EXPLODED = -1e4  # nats
 _LEAST = 1e-4  # raw units: a sensor's noise is at least this
 _STEP = 0.05  # of a place's range, between which its measurements are taken to be linear
@@ -68,7 +69,7 @@ def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key
     """
     key_start, key_steps = jax.random.split(key)
     worlds, start = _starts(env, candidates, point, rollout.measured[0], key_start, states)
-    noise, bias = _noise(start)[0], start.effects.obs_bias[0]
+    noise, bias = _ALLOWED * _noise(start)[0], start.effects.obs_bias[0]
 
     def weigh(state: EnvState, measured: Array) -> Array:
         """[] nats of one state."""
