@@ -163,8 +163,8 @@ SCENE = arm.scene(
     parameters=PARAMETERS,
     episode_length=50,
     substeps=SUBSTEPS,
-    # Joints sag under a tool more than Cartesian commands drift.
     workspace=((0.28, 0.5), (0.0, 0.0), (0.44, 0.72)),
+    # Joints sag under a tool more than Cartesian commands drift.
     actuators={**arm.NOISE, "action_scale": [[0.6] * 3, [1.4] * 3], "action_bias": [[-0.3] * 3, [0.3] * 3]},
     build=build,
     initial=initial,

@@ -35,8 +35,9 @@ from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.models.distortion import none
 from sgft_jax.posterior.candidates import Candidates, candidates
 from sgft_jax.posterior.decision import Decision, correction, decide
-from sgft_jax.posterior.replay import Rollout, likelihood, replay, rollout_of
+from sgft_jax.posterior.replay import Rollout, likelihood, rollout_of
 from sgft_jax.posterior.smc import Likelihood, Particles, begin, sample
+from sgft_jax.stacking import join, member, stack
 
 _BEATEN, _SYSTEMS = 0.9, 0.8  # gate 1: the truth beats so many draws, on so many systems
 EXPONENTS = (0.01, 0.02, 0.05, 0.1, 0.2)
@@ -139,15 +140,13 @@ def _gate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
     others = setup.systems.draw(key_draws, args.draws)
 
     def explain(point: Array, rollouts: Rollout, key: Key) -> tuple[Array, Array]:
-        keys = jax.random.split(key, len(rollouts.success))
-        one = functools.partial(replay, setup.simulator, setup.systems, point, states=args.states)
-        evidence = jax.vmap(one)(rollouts, keys)
+        evidence = replays(setup.simulator, setup.systems, point, rollouts, key, states=args.states)
         return evidence.log_likelihood.sum(), evidence.success
 
     replayed = jax.jit(jax.vmap(explain, (0, None, 0)))
     beaten, right, seconds = [], [], []
     for number in range(args.systems):
-        real = _part(setup.rollouts, number)
+        real = member(setup.rollouts, number)
         points = jnp.concatenate([setup.true[number : number + 1], others])
         keys = jax.random.split(jax.random.fold_in(key_replay, number), len(points))
         begun = time.perf_counter()
@@ -208,8 +207,7 @@ def _decide(setup: Setup, points: Array, true: Array, key: Key) -> tuple[Decisio
     key_decide, key_played = jax.random.split(key)
     undo = jax.vmap(lambda point: correction(setup.env, setup.systems.unknowns, point))
     tried = undo(points[:_CANDIDATES])
-    nothing = none(setup.env.act_dim, setup.env.measured_dim)
-    acting = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), nothing, tried)
+    acting = join([stack([none(setup.env.act_dim, setup.env.measured_dim)]), tried])
 
     def success(distortion: PyTree, world: World, key: Key) -> Array:
         return setup.play(distortion, world, key).success
@@ -219,7 +217,7 @@ def _decide(setup: Setup, points: Array, true: Array, key: Key) -> tuple[Decisio
 
     def play(number: Array, key: Key) -> Array:
         key_world, key_play = jax.random.split(key)
-        return success(_part(acting, number), setup.systems.episode(true, key_world), key_play)
+        return success(member(acting, number), setup.systems.episode(true, key_world), key_play)
 
     keys = jax.random.split(key_played, _PLAYED)
     of_both = jax.vmap(jax.vmap(play, (None, 0)), (0, None))(
@@ -265,10 +263,6 @@ def _table(lines: list[dict[str, Any]]) -> str:
     rows = [{name: x for name, x in line.items() if not isinstance(x, dict)} for line in lines]
     cells = [[f"{x:.3g}" if isinstance(x, float) else str(x) for x in row.values()] for row in rows]
     return tables.markdown(list(rows[0]), cells)
-
-
-def _part(tree: PyTree, number: Any) -> PyTree:
-    return jax.tree.map(lambda x: x[number], tree)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from envs.base import Env, EnvState, World
+from envs.base import Effects, Env, EnvState, World
 from envs.rollout import Episode
 from envs.types import Array, Key, UserError
 from sgft_jax.posterior.candidates import Candidates
@@ -69,7 +69,7 @@ def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key
     """
     key_start, key_steps = jax.random.split(key)
     worlds, start = _starts(env, candidates, point, rollout.measured[0], key_start, states)
-    noise, bias = _ALLOWED * _noise(start)[0], start.effects.obs_bias[0]
+    noise, bias = _ALLOWED * _noise(start.effects)[0], start.effects.obs_bias[0]
 
     def weigh(state: EnvState, measured: Array) -> Array:
         """[] nats of one state."""
@@ -94,13 +94,19 @@ def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key
     return Evidence(log_likelihood, (last.success & ~last.invalid).mean())
 
 
+def replays(
+    env: Env, candidates: Candidates, point: Array, rollouts: Rollout, key: Key, *, states: int = 8
+) -> Evidence:
+    """The evidence [k] of rollouts [k] for the candidate at a point [d], see `replay`."""
+    keys = jax.random.split(key, len(rollouts.success))
+    return jax.vmap(functools.partial(replay, env, candidates, point, states=states))(rollouts, keys)
+
+
 def likelihood(env: Env, candidates: Candidates, rollouts: Rollout, *, states: int = 8) -> Likelihood:
     """Of rollouts [k] together, for many candidates."""
 
     def of_one(point: Array, key: Key) -> Array:
-        keys = jax.random.split(key, len(rollouts.success))
-        explain = functools.partial(replay, env, candidates, point, states=states)
-        return jax.vmap(explain)(rollouts, keys).log_likelihood.sum()
+        return replays(env, candidates, point, rollouts, key, states=states).log_likelihood.sum()
 
     return jax.vmap(of_one)
 
@@ -124,7 +130,7 @@ def _starts(
 
     def begin(drawn: Array, noisy: Array) -> tuple[World, EnvState]:
         world = candidates.world(point, jnp.clip(middle + spread @ drawn, candidates.low, candidates.high))
-        noise = _noise(_restore(env)(world, measured, key_effects))
+        noise = _noise(world.theta.effects.low)  # of a candidate both ends are alike
         return world, _restore(env)(world, measured + noise * noisy, key_effects)
 
     return jax.vmap(begin)(drawn, noisy)
@@ -146,11 +152,11 @@ def _place(env: Env, candidates: Candidates, point: Array, measured: Array, key:
     here, steps = seen(middle), jnp.diag(_STEP * size)
     beside = jax.vmap(lambda step: seen(middle + step).true_obs)(steps)
     slope = jax.vmap(lambda obs, width: (obs - here.true_obs) / width)(beside, _STEP * size).T
-    missed = measured - here.effects.obs_bias - here.true_obs
+    missed, noise = measured - here.effects.obs_bias - here.true_obs, _noise(here.effects)
     with jax.default_matmul_precision("highest"):
-        precision = slope.T @ slope / _noise(here) ** 2 + jnp.diag(12.0 / size**2)
+        precision = slope.T @ slope / noise**2 + jnp.diag(12.0 / size**2)
         covariance = jnp.linalg.inv(precision)
-        mean = middle + covariance @ (slope.T @ missed) / _noise(here) ** 2
+        mean = middle + covariance @ (slope.T @ missed) / noise**2
     return mean, jnp.linalg.cholesky(covariance)
 
 
@@ -161,9 +167,9 @@ def _restore(env: Env) -> Callable[[World, Array, Key], EnvState]:
     return env.restore
 
 
-def _noise(state: EnvState) -> Array:
+def _noise(effects: Effects) -> Array:
     """[...] std of a number that is measured, raw units."""
-    return jnp.maximum(state.effects.obs_noise * jnp.sqrt(state.effects.obs_noise_prob), _LEAST)
+    return jnp.maximum(effects.obs_noise * jnp.sqrt(effects.obs_noise_prob), _LEAST)
 
 
 def _log_density(x: Array) -> Array:
