@@ -35,7 +35,7 @@ from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.models.distortion import none
 from sgft_jax.posterior.candidates import Candidates, candidates
 from sgft_jax.posterior.decision import Decision, correction, decide
-from sgft_jax.posterior.replay import Rollout, likelihood, rollout_of
+from sgft_jax.posterior.replay import Rollout, likelihood, replays, rollout_of
 from sgft_jax.posterior.smc import Likelihood, Particles, begin, sample
 from sgft_jax.stacking import join, member, stack
 
@@ -156,8 +156,8 @@ def _gate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
         beaten.append(float((total[0] > total[1:]).mean()))
         right.append(float(np.where(real.success, success[0], 1.0 - success[0]).mean()))
     simulator, passed = setup.simulator, float(np.mean(np.array(beaten) >= _BEATEN))
-    replays = (args.draws + 1) * setup.rollouts.success.shape[1] * args.states
-    steps = replays * simulator.episode_length * envs.scene(simulator.name).substeps
+    count = (args.draws + 1) * setup.rollouts.success.shape[1] * args.states
+    steps = count * simulator.episode_length * envs.scene(simulator.name).substeps
     return [
         {
             "systems passed": passed,
