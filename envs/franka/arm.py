@@ -43,6 +43,7 @@ JOINT_DAMPING = 1.0
 # at the end of a 0.2 s control period, so observations at 5 Hz need no memory of the command.
 STIFFNESS = np.array([4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0])
 DAMPING_TIME = 1 / 20  # s
+GRIP_TIME = 0.04  # s: what a grip that gives way needs to come back
 # Gripper down, elbow up, in front of the base.
 Q_HOME = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4])
 
@@ -93,6 +94,21 @@ def add_arm(spec: mujoco.MjSpec, *, stiffness: float = 1.0) -> mujoco.MjsBody:
         add_servo(spec, f"joint{i + 1}", kp, kp * DAMPING_TIME, TORQUE_MAX[i], name=f"servo{i + 1}")
     add_capsule(body, 0.04, fromto=[0, 0, FLANGE, 0, 0, FLANGE + 0.02], mass=0, rgba=_DARK)
     add_box(body, [0.025, 0.1, 0.03], pos=[0, 0, FLANGE + 0.045], quat=HAND_TURN, mass=HAND_MASS, rgba=_DARK)
+    return body
+
+
+def add_loose(link: mujoco.MjsBody, stiffness: float, *axes: tuple[float, float]) -> mujoco.MjsBody:
+    """What the hand holds, as a body in the frame of the last link that gives way about the tool centre point.
+
+    stiffness: N m/rad, about each of these axes, xy in the frame of the hand.
+    """
+    body = link.add_body()
+    damping = stiffness * GRIP_TIME  # MuJoCo's solver of contacts does not see it: the inertia stands for it
+    for axis in axes:
+        spring = {"stiffness": stiffness, "damping": damping, "armature": damping * GRIP_TIME / 4}
+        add_hinge(body, [*across(*axis), 0.0], pos=[0, 0, TCP], **spring)
+    # Between the fingers; a sphere alone, the hammer's face, has no axes of inertia.
+    add_box(body, [0.004, 0.008, 0.016], pos=[0, 0, TCP], mass=0.01, rgba=_DARK)
     return body
 
 

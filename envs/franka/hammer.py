@@ -11,6 +11,8 @@ no contact of their own, because they stay above it. The elbow may start beside 
 the elbow the board is a block with an edge.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -20,7 +22,7 @@ from envs.base import Entry, Parameter
 from envs.franka import arm
 from envs.franka.arm import across, at_rest
 from envs.mujoco import parts
-from envs.mujoco.scene import View
+from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -50,6 +52,7 @@ PAIRS = (
     *((name, "block") for name in ELBOW),
 )
 BOARD_THICKNESS = 0.06  # m
+GRIPS = (2.0, 4.0, 8.0)  # N m/rad, of real systems
 DOME = 0.007  # m, of the head that is drawn
 _RED = [0.8, 0.15, 0.1, 1]
 NV = arm.N_JOINTS + 1
@@ -69,11 +72,11 @@ PARAMETERS = (
 _INDEX = {p.name: i for i, p in enumerate(PARAMETERS)}
 
 
-def build(theta: dict[str, float]) -> mujoco.MjSpec:
-    """The scene for one theta."""
+def build(theta: dict[str, float], grip: float | None = None) -> mujoco.MjSpec:
+    """The scene for one theta. grip: N m/rad, of a hand in which the hammer turns; None holds it rigidly."""
     spec = arm.new_spec(substeps=SUBSTEPS, iterations=2, ls_iterations=4)
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
-    _add_hammer(link, theta["hammer_mass"])
+    _add_hammer(link if grip is None else arm.add_loose(link, grip, (0.0, 1.0)), theta["hammer_mass"])
     spec.body("link6").geoms[0].name = "wrist"  # the link's capsule, as drawn
     for name, center in ELBOW.items():
         parts.add_sphere(spec.body("link4"), ELBOW_RADIUS, name=name, pos=center, mass=0, rgba=parts.INVISIBLE)
@@ -90,7 +93,7 @@ def observe(params: Array, state: PhysicsState) -> Array:
     """[12]: face xyz (m), q of joints 2, 4, 6 (rad), their velocities (rad/s), nail z (m), goal xz (m)."""
     joints, velocities = state.qpos[JOINTS], state.qvel[JOINTS]
     goal = jnp.stack([params[_INDEX["nail_x"]], _board(params)])
-    nail = goal[1:] + state.qpos[arm.N_JOINTS :]
+    nail = goal[1:] + state.qpos[-1:]
     face = arm.forward(state.qpos[: arm.N_JOINTS], jnp.asarray(TOOL, jnp.float32)).position
     return jnp.concatenate([face, joints, velocities, nail, goal])
 
@@ -177,6 +180,20 @@ SCENE = arm.scene(
     dress=dress,
     view=View((0.36, 0.0, 0.58), 0.52, 65.0, -16.0, 0.0),
 )
+
+
+def loose(grip: float) -> Scene:
+    """Hammering where the hammer turns in the hand, which nothing measures. Coordinates: arm, that angle, nail."""
+
+    def begun(params: Array, key: Key) -> PhysicsState:
+        state = initial(params, key)
+        return at_rest(state.ctrl, jnp.insert(state.qpos[arm.N_JOINTS :], 0, 0.0), NV + 1)
+
+    name = f"grip-{grip:g}"
+    return SCENE._replace(variant=name, build=functools.partial(build, grip=grip), initial=begun, settled=None)
+
+
+REAL = {scene.variant: scene for scene in map(loose, GRIPS)}
 
 
 def _exposed(obs: Array) -> Array:

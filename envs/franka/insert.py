@@ -22,7 +22,7 @@ from envs.base import Entry, Parameter
 from envs.franka import arm
 from envs.franka.arm import at_rest, new_spec, solve_down
 from envs.mujoco.parts import INVISIBLE, add_box, add_cylinder, add_pair, add_sphere
-from envs.mujoco.scene import View
+from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -40,6 +40,7 @@ FINGER_HALF = np.array([0.009, 0.006, 0.025])  # m
 WALL_HALF = np.array([0.2, 0.2, 0.05])  # m: large enough for the workspace
 GRASP = 0.06  # m from the tool centre point down to the leg's tip
 TIP_ROUNDING = 0.003  # m
+GRIPS = (1.0, 1.4, 2.0)  # N m/rad, of real systems
 UPPER_BALL = 0.018  # m above the tip's ball: it enters the hole's mouth when the leg is nearly assembled
 WORKSPACE = np.array([[0.30, -0.30, TOP - DEPTH], [0.70, 0.30, 0.25]])  # m, of the leg's tip, base frame
 START_LOW, START_HIGH = np.array([-0.05, -0.05, 0.05]), np.array([0.05, 0.05, 0.10])  # m, from the nominal hole's mouth
@@ -65,13 +66,16 @@ PARAMETERS = (
 )
 
 
-def build(theta: dict[str, float]) -> mujoco.MjSpec:
-    """The scene for one theta. The table top is fixed to the table."""
+def build(theta: dict[str, float], grip: float | None = None) -> mujoco.MjSpec:
+    """The scene for one theta. The table top is fixed to the table. grip: N m/rad, of a hand in which the leg tilts;
+    None holds it rigidly.
+    """
     spec = new_spec(substeps=SUBSTEPS, iterations=4, ls_iterations=6)
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for servo in spec.actuators:
         servo.biasprm[2] = servo.biasprm[1] * DAMPING_TIME
-    _add_leg(link, theta["peg_radius"])
+    leg = link if grip is None else arm.add_loose(link, grip, (1.0, 0.0), (0.0, 1.0))
+    _add_leg(leg, theta["peg_radius"])
     _add_fingers(link)
     _add_part(spec, theta)
     for ball in ("tip", "shaft"):
@@ -160,6 +164,25 @@ SCENE = arm.scene(
     dress=functools.partial(arm.dress, table=(-0.15, 0.75, 0.4)),
     view=View((0.49, 0.0, 0.05), 0.38, 135.0, -22.0, arm.FLOOR),
 )
+
+
+def loose(grip: float) -> Scene:
+    """Insertion where the leg tilts in the hand; what is seen is where it is. Coordinates: arm, the two angles."""
+
+    def begun(params: Array, key: Key) -> PhysicsState:
+        return at_rest(initial(params, key).ctrl, jnp.zeros(2), NV + 2)
+
+    def seen(params: Array, state: PhysicsState) -> Array:
+        pose = arm.forward(state.qpos[: arm.N_JOINTS])
+        (sx, sy), (cx, cy) = jnp.sin(state.qpos[arm.N_JOINTS :]), jnp.cos(state.qpos[arm.N_JOINTS :])
+        tip = pose.position + pose.rotation @ jnp.stack([sy, -sx * cy, cx * cy]) * GRASP
+        return jnp.concatenate([pose.position, tip, assembled(params)])
+
+    scene = SCENE._replace(variant=f"grip-{grip:g}", build=functools.partial(build, grip=grip), settled=None)
+    return scene._replace(initial=begun, observe=seen)
+
+
+REAL = {scene.variant: scene for scene in map(loose, GRIPS)}
 
 
 def _tip(joints: Array) -> Array:

@@ -21,7 +21,7 @@ from envs.base import Entry, Parameter
 from envs.franka import arm
 from envs.franka.arm import at_rest, new_spec, solve_down
 from envs.mujoco import parts
-from envs.mujoco.scene import View
+from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -39,6 +39,9 @@ PUCK_RADIUS, PUCK_HALF_HEIGHT = 0.032, 0.015  # m
 WORKSPACE = np.array([[0.08, -0.35], [0.56, 0.35]])  # m, xy of the hand, table frame
 FALLEN_AT, SEEN_AT = 1.5, EDGE + 0.03  # m, table frame: where a fallen puck lies, where the camera saw it last
 GRAVITY = 9.81  # m/s^2
+SOFT = 0.01  # N/m
+TILTS = (-18, -15, -12, 12, 15, 18)  # degrees, of real systems
+PATCHES, PATCH, _WAVES = 16.0, 0.05, 32  # factor of friction; m over which it changes
 # Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4 iterations
 # on every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
 RUBBER = (0.0, 0.95, 0.003, 0.5, 2.0)
@@ -57,15 +60,18 @@ PARAMETERS = (
 )
 
 
-def build(theta: dict[str, float]) -> mujoco.MjSpec:
-    """The scene for one theta. The puck's start is part of the state, not of the model."""
+def build(theta: dict[str, float], tilt: float = 0.0) -> mujoco.MjSpec:
+    """The scene for one theta. The puck's start is part of the state, not of the model.
+
+    tilt: rad, of the table about the x axis, as the puck feels it: it slides to +y.
+    """
     spec = new_spec(substeps=SUBSTEPS, iterations=4, ls_iterations=6)
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side in FINGERS:
         _add_finger(link, side)
     parts.add_plane(spec, "table")
     add_scenery(spec)
-    _add_puck(spec, theta["object_mass"])
+    _add_puck(spec, theta["object_mass"], tilt)
     friction = theta["table_friction"]
     spin = friction * PUCK_RADIUS * 2 / 3  # of a disc under uniform pressure
     kind: dict[str, Any] = {"condim": 4} if friction else {"solimp": RUBBER}
@@ -180,6 +186,27 @@ SCENE = arm.scene(
 )
 
 
+def tilted(degrees: float) -> Scene:
+    """Pushing on a table that slopes sideways."""
+    return SCENE._replace(variant=f"tilt{degrees:+g}", build=functools.partial(build, tilt=np.radians(degrees)))
+
+
+def patchy(seed: int) -> Scene:
+    """Pushing on a table whose friction changes smoothly from place to place, by a factor of 1/16 to 4."""
+    rng = np.random.default_rng(seed)
+    waves, phases = rng.normal(size=(_WAVES, 2)) / PATCH, rng.uniform(0, 2 * np.pi, _WAVES)
+
+    def adjust(params: Array, state: PhysicsState, fields: dict[str, Array]) -> dict[str, Array]:
+        wave = np.sqrt(2 / _WAVES) * jnp.cos(jnp.asarray(waves, jnp.float32) @ _puck(state.qpos) + phases).sum()
+        friction = fields["pair_friction"]  # the first pair: table and puck
+        return {**fields, "pair_friction": friction.at[0].multiply(PATCHES ** jnp.clip(wave, -1.0, 0.5))}
+
+    return SCENE._replace(variant=f"patches-{seed}", adjust=adjust)
+
+
+REAL = {scene.variant: scene for scene in (*map(tilted, TILTS), *map(patchy, range(4)))}
+
+
 def _place(xy: Array, height: float) -> Array:
     """[3] m, base frame, of a point of the table frame."""
     return jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([height])])
@@ -191,13 +218,14 @@ def _add_finger(link: mujoco.MjsBody, side: int) -> None:
     parts.add_capsule(link, FINGER_RADIUS, fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP], mass=0, rgba=dark)
 
 
-def _add_puck(spec: mujoco.MjSpec, mass: float) -> None:
+def _add_puck(spec: mujoco.MjSpec, mass: float, tilt: float) -> None:
     """A disc that slides and spins but does not tilt: one contact with torsional friction stands for its whole face."""
     body = spec.worldbody.add_body(name="puck", pos=[0, 0, PUCK_HALF_HEIGHT])
-    for axis in np.eye(3)[:2]:
-        parts.add_slide(body, axis)
-    # Weight, in a scene without gravity: a spring of 1 N/m whose rest length is mass * g away.
-    parts.add_slide(body, [0, 0, 1], stiffness=1.0, springref=-mass * GRAVITY)
+    parts.add_slide(body, [1, 0, 0])
+    # Weight, in a scene without gravity: springs whose rest lengths are weight / stiffness away.
+    side = {"stiffness": SOFT, "springref": mass * GRAVITY * np.sin(tilt) / SOFT} if tilt else {}
+    parts.add_slide(body, [0, 1, 0], **side)
+    parts.add_slide(body, [0, 0, 1], stiffness=1.0, springref=-mass * GRAVITY * np.cos(tilt))
     parts.add_hinge(body, [0, 0, 1])
     parts.add_cylinder(body, PUCK_RADIUS, PUCK_HALF_HEIGHT, mass=mass, rgba=[0.85, 0.25, 0.2, 1])
     hidden, foot = {"mass": 0, "rgba": parts.INVISIBLE}, PUCK_HALF_HEIGHT / 2

@@ -63,6 +63,8 @@ class Scene(NamedTuple):
         table: see `Env`.
     measured(params, before, action, after) -> Measured: where reward, end or success are no functions of observations.
         `reward` may then approximate it; what is measured is what counts.
+    adjust(params, state, fields) -> the fields of the model, by name, in force during the next step; default `fields`,
+        those of the world.
     event(params, state) -> state: what happens between control steps (a fallen object stays down); default nothing.
     max_speed: m/s or rad/s, ten times what any joint or object reaches: beyond it the physics has exploded.
     engine: one of its own in place of MJX's JAX code, for scenes whose motion someone wrote down.
@@ -88,6 +90,7 @@ class Scene(NamedTuple):
     measured: Callable[[Array, PhysicsState, Array, PhysicsState], Measured] = lambda *step: Measured()
     motors: Callable[[Array, Array, Array], Array] = lambda params, previous, target: target
     event: Callable[[Array, PhysicsState], PhysicsState] = lambda params, state: state
+    adjust: Callable[[Array, PhysicsState, dict[str, Array]], dict[str, Array]] = lambda params, state, fields: fields
     ramp: float = 0.0
     success_anytime: bool = False
     score: str = "success"
@@ -186,7 +189,8 @@ def _step(scene: Scene, engine: Engine, world: World, state: EnvState, action: A
     dt = scene.control_dt / scene.substeps
     control = effects.ramp(episode, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
     controls = jax.vmap(control)(jnp.arange(scene.substeps))
-    after = scene.event(params, engine.advance(world.model, before, controls))
+    model = scene.adjust(params, before, world.model)
+    after = scene.event(params, engine.advance(model, before, controls))
     true_obs = pack(scene.observation, scene.observe(params, after))
     reward, terminated, now = _outcome(scene, params, state, action, after, true_obs)
     time = state.time + 1

@@ -40,7 +40,7 @@ def run(args: "GapsArgs", seeds: list[int], folders: list[Path]) -> dict[str, An
     """Measures, prints a table, writes and returns the summary. folders: of the priors."""
     task = envs.name_of(args.task)
     env = envs.make(args.task, args.impl, **observed_by(folders))
-    reals = [gaps.load(env, name) for name in args.presets or gaps.presets(task)]
+    reals = [gaps.load(env, name) for name in args.presets or gaps.presets(task, variants=False)]
     env = real_env(env, reals)
     folder = args.out / "gaps" / task
     priors = load_priors(folders, env)
