@@ -162,7 +162,7 @@ def test_splines_run_through_the_points():
 
 
 def test_scenes_by_name():
-    with pytest.raises(UserError, match="push: scene: there is no .towel."):
+    with pytest.raises(UserError, match="push: scene: there is no 'towel'"):
         envs.scene("push", "towel")
     with pytest.raises(UserError, match=r"push-towel: scene: there is no 'towl', did you mean 'towel'\?"):
         envs.make("push-towel", "c", "towl")
