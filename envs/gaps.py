@@ -2,7 +2,8 @@
 
 A gap names only what differs; everything else stays as in training. `params` fixes domain parameters (or gives them
 another range), also outside the training range; `effects` distorts commands and measurements, see `envs.base.Effects`;
-`commands` are errors of commands that the simulator never has, see `envs.base.COMMANDS`.
+`commands` are errors of commands that the simulator never has, see `envs.base.COMMANDS`; `drift` says how much further
+off sensors are with every rollout of fine-tuning, raw units by entry name, added to `obs_bias`.
 `scene` names another scene than the simulated one, see `envs.make`: a towel where the simulator has a puck. `families`
 says which kinds of difference were drawn, see `envs.gap_distribution`, and `stratum` how often the simulator's policies
 succeed there, see `experiments.gaps`; only tables read them.
@@ -19,15 +20,16 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from envs import extend
-from envs.base import COMMANDS, Effects, Env, Value, World
+from envs.base import COMMANDS, Effects, Env, Numbers, Value, World
 from envs.files import parse_json, read_json, read_toml
-from envs.types import Key, UserError, unknown
+from envs.types import Array, Key, UserError, unknown
 
 __all__ = ["Gap", "changes", "each", "find", "from_dict", "load", "presets", "read_file", "title", "to_toml"]
 __all__ += ["usual", "worlds"]
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
-_KEYS = frozenset({"params", "effects", "commands", "scene", "families", "stratum"})
+_TABLES = ("params", "effects", "commands", "drift")
+_KEYS = frozenset({*_TABLES, "scene", "families", "stratum"})
 _FILE = re.compile(r"(.*\.(?:toml|json))(?::(.+))?")  # a file, or one gap of a file
 
 
@@ -37,6 +39,7 @@ class Gap(NamedTuple):
     Ranges are [low, high], of vectors [[low, ...], [high, ...]]; a vector may be a table by entry name, see
     `envs.effects.make_range`. Every episode draws its effects from their ranges. families: of a gap that was drawn.
     stratum: "solved", "partial" or "failed" of one that was measured too. commands: how they err.
+    drift: raw units by which sensors are further off with every rollout, by entry name.
     """
 
     name: str
@@ -46,12 +49,12 @@ class Gap(NamedTuple):
     families: tuple[str, ...] = ()
     stratum: str = ""
     commands: Mapping[str, float] = MappingProxyType({})
+    drift: Mapping[str, Numbers] = MappingProxyType({})
 
     @property
     def table(self) -> dict[str, Any]:
-        """For files, every field by its name: `commands` only where there are any, as in files of before."""
-        table = self._asdict()
-        return table if self.commands else {name: table[name] for name in table if name != "commands"}
+        """For files, every field by its name: `commands` and `drift` where there are any, as in files of before."""
+        return {name: x for name, x in self._asdict().items() if x or name not in ("commands", "drift")}
 
 
 def presets(task: str, *, variants: bool = True) -> dict[str, Gap]:
@@ -158,13 +161,28 @@ def worlds(env: Env, gap: Gap, key: Key, n: int = 256) -> World:
     return given(env, pool, gap.commands) if gap.commands else pool
 
 
+def drifts(env: Env, real_gaps: Sequence[Gap]) -> Array | None:
+    """[gaps, measured_dim] raw units by which sensors are further off with every rollout; None where none drifts."""
+    if not any(gap.drift for gap in real_gaps):
+        return None
+    import jax.numpy as jnp
+
+    from envs.effects import make_range
+
+    try:
+        ranges = [make_range(env, {"obs_bias": gap.drift}) for gap in real_gaps]
+    except UserError as error:
+        raise UserError(f"'drift' is a rate of 'obs_bias': {error}") from None
+    if any((ends.low.obs_bias != ends.high.obs_bias).any() for ends in ranges):
+        raise UserError("'drift' needs numbers, not ranges")
+    return jnp.stack([ends.low.obs_bias for ends in ranges])
+
+
 def to_toml(listed: Iterable[Gap]) -> str:
     """Gaps as the text of a file that holds several, for people too. `read_file` gives back the same gaps."""
     lines: list[str] = []
     for gap in listed:
-        values = {
-            name: getattr(gap, name) for name in ("stratum", "scene", "families", "params", "effects", "commands")
-        }
+        values = {name: getattr(gap, name) for name in ("stratum", "scene", "families", *_TABLES)}
         lines += ["", f"[{_key(gap.name)}]", *(f"{name} = {_inline(value)}" for name, value in values.items() if value)]
     return "\n".join([*lines[1:], ""])
 
@@ -190,8 +208,8 @@ def _parse(name: str, table: Any, *, where: str) -> Gap:
     if not isinstance(table, dict) or set(table) - _KEYS:
         odd = sorted({*table} - _KEYS)[0] if isinstance(table, dict) else type(table).__name__
         raise UserError(
-            f"{where}: unexpected '{odd}'; a gap has tables 'params', 'effects' and 'commands', and may name a "
-            "'scene', 'families' and a 'stratum'"
+            f"{where}: unexpected '{odd}'; a gap has tables 'params', 'effects', 'commands' and 'drift', and may name "
+            "a 'scene', 'families' and a 'stratum'"
         )
     families = table.get("families", [])
     if not isinstance(families, list) or not all(isinstance(family, str) for family in families):
@@ -199,7 +217,7 @@ def _parse(name: str, table: Any, *, where: str) -> Gap:
     words = {key: table.get(key, "") for key in ("scene", "stratum")}
     if odd := [key for key, word in words.items() if not isinstance(word, str)]:
         raise UserError(f"{where}: '{odd[0]}' must be a name, got {words[odd[0]]!r}")
-    tables = {section: table.get(section, {}) for section in ("params", "effects", "commands")}
+    tables = {section: table.get(section, {}) for section in _TABLES}
     for section, values in tables.items():
         if not isinstance(values, dict):
             raise UserError(f"{where}: '{section}' must be a table of names and numbers, got {values!r}")
@@ -255,5 +273,7 @@ def _check(env: Env, gap: Gap) -> None:
         uniform(env, gap.params, gap.effects)
         if gap.commands:
             make_commands(env, gap.commands)
+        if gap.drift:
+            drifts(env, [gap])
     except UserError as error:
         raise UserError(f"gap '{gap.name}': {error}") from None

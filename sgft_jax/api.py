@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 import envs
 from envs.base import Env
-from envs.gaps import Gap, from_dict
+from envs.gaps import Gap, drifts, from_dict
 from envs.observations import remember, with_memory
 from envs.rollout import Episode, heldout_worlds, real_env, real_worlds, training_worlds
 from envs.types import Array, Policy, PyTree, UserError
@@ -89,7 +89,8 @@ def setup(
         gaps = [real] if isinstance(real, Gap) else list(real)
         gamma, copies, scene = card_of(known[0] if known else None)["gamma"], len(gaps), real_env(env, gaps)
         which = jnp.repeat(jnp.arange(copies), len(numbers))
-        system = Simulated(scene, real_worlds(scene, gaps, jax.random.key(0)), which, gamma=gamma)
+        pools, drift = real_worlds(scene, gaps, jax.random.key(0)), drifts(scene, gaps)
+        system = Simulated(scene, pools, which, gamma=gamma, drift=drift)
     stacked = stack([prior.params for prior in known]) if known else None
     members = jnp.tile(jnp.array(list(numbers), jnp.uint32), copies)
     needs = finetuner.simulation

@@ -37,7 +37,7 @@ from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.real import RealStore
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, member, part
-from sgft_jax.systems.simulated import KnownSystem, Simulated, System
+from sgft_jax.systems.simulated import KnownSystem, Simulated, System, drifted
 from sgft_jax.train import finetuning, simulation
 from sgft_jax.train.finetuning import FinetuneProgress, Programs
 from sgft_jax.train.learner_process import LearnerProcess
@@ -357,7 +357,7 @@ class _Run(Training):
         if self.system.pools is None:  # its episodes are real ones, and as dear as those of training
             stores = [evaluation_store(record.folder, done) for record in self.records]
             system = RecordedSystem(system, stores, done=0, explore=False, sync_every=self.sync_every)
-        played = finetuning.evaluate(self.finetuner, system, state.agent, self.seeds, self.episodes)
+        played = finetuning.evaluate(self.finetuner, drifted(system, done), state.agent, self.seeds, self.episodes)
         self.played = {n: x for n, x in [*self.played.items(), (done, played)] if n in (0, done)}
         values = _scores(played, state.best.worst)
         for record, (score, cost) in self.each((values, np.asarray(played.valid.sum((1, 2))))):
@@ -382,7 +382,8 @@ class _Run(Training):
         n = self.episodes
         if n and self.system.pools is not None:
             with doing("evaluating the best policies", 15, once=True):
-                played = finetuning.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
+                system = drifted(self.system, self.done(progress))
+                played = finetuning.evaluate(self.finetuner.policy, system, best.params, self.seeds, n)
             facts["score"] = _scores(played, best.worst)["score"]
         films = functools.cache(lambda: self._before_and_after(progress))
         summaries = []
@@ -427,6 +428,10 @@ class _Awaited:
 
     def __init__(self, inner: Simulated, ahead: Ahead) -> None:
         self.inner, self.ahead, self.env, self.pools = inner, ahead, inner.env, inner.pools
+
+    def after(self, rollouts: int) -> "_Awaited":
+        """See `Simulated`."""
+        return _Awaited(self.inner.after(rollouts), self.ahead)
 
     def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
         """See `System`."""

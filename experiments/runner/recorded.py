@@ -18,7 +18,7 @@ from sgft_jax.datasets.logs import Log
 from sgft_jax.io.real import RealStore
 from sgft_jax.stacking import join, part
 from sgft_jax.systems.gymnasium import Step
-from sgft_jax.systems.simulated import SteppedSystem, System
+from sgft_jax.systems.simulated import SteppedSystem, System, drifted
 from sgft_jax.train.finetuning import Logged
 from sgft_jax.types import Finetuner, Successors
 
@@ -71,7 +71,7 @@ class RecordedSystem:
         if missing and self.sync_every is not None:
             self._play_robot(number, policy, states, keys[:, 0])
         elif missing:
-            episodes = self.inner.play(policy, states, keys, explore=self.explore)
+            episodes = drifted(self.inner, number).play(policy, states, keys, explore=self.explore)
             for i, store in enumerate(self.stores):
                 if len(store) <= number:
                     store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import jax
 
-from envs.base import Env, World
+from envs.base import EffectRange, Env, World
 from envs.mesh import split_vmap
 from envs.rollout import Episode, play_episode
 from envs.types import Array, Key, PyTree
@@ -60,15 +60,20 @@ class SteppedSystem(KnownSystem, Protocol):
         ...
 
 
+def drifted(system: System, rollouts: int) -> System:
+    """A system as it is after so many rollouts: of simulated ones, sensors may drift; a real one needs no help."""
+    return getattr(system, "after", lambda rollouts: system)(rollouts)
+
+
 class Simulated:
     """Perturbed simulations: all members and episodes in one compiled program.
 
     env: what steps them. pools: worlds [G, W], a pool for each real system. which: [M], the system of each member.
-    gamma: discount factor of the transitions.
+    gamma: discount factor of the transitions. drift: [G, measured_dim] see `envs.gaps.drifts`.
     """
 
-    def __init__(self, env: Env, pools: World, which: Array, *, gamma: float) -> None:
-        self.env, self.pools, self.which, self.gamma = env, pools, which, gamma
+    def __init__(self, env: Env, pools: World, which: Array, *, gamma: float, drift: Array | None = None) -> None:
+        self.env, self.pools, self.which, self.gamma, self.drift = env, pools, which, gamma, drift
         self._programs: dict[Callable[..., Any], Callable[..., Episode]] = {}
 
     def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
@@ -86,6 +91,14 @@ class Simulated:
         other = Simulated(self.env, pools, which, gamma=self.gamma)
         other._programs = self._programs
         return other
+
+    def after(self, rollouts: int) -> "Simulated":
+        """The systems as they are after so many rollouts from here: their sensors may have drifted."""
+        if self.drift is None:
+            return self
+        theta, further = self.pools.theta, rollouts * self.drift[:, None]
+        ends = (end._replace(obs_bias=end.obs_bias + further) for end in theta.effects)
+        return self.moved(self.pools._replace(theta=theta._replace(effects=EffectRange(*ends))), self.which)
 
     def _player(self, policy: Any) -> Callable[..., Episode]:
         def play(state: PyTree, pools: World, which: Array, keys: Key, explore: Array) -> Episode:

@@ -15,7 +15,7 @@ from envs.mesh import split_vmap
 from envs.rollout import Episode
 from envs.types import Array, Key, PyTree, Transition, UserError
 from sgft_jax.keys import Finetuning
-from sgft_jax.systems.simulated import System
+from sgft_jax.systems.simulated import System, drifted
 from sgft_jax.train import evidence
 from sgft_jax.train.evidence import Best
 from sgft_jax.train.simulation import SimulatedRows
@@ -346,8 +346,12 @@ class _Steps:
         who, states = self.finetuner, agent
         if done == 0 and who.initial_policy is not None:
             who, states = who.initial_policy, priors_of_members(self.priors, self.seeds)
-        keys = [_episode_keys(self.seeds, Finetuning.COLLECT, rollout, 1) for rollout in range(done, done + n)]
-        return [self.system.play(who, states, key, explore=True) for key in keys]
+
+        def rollout(number: int) -> Episode:
+            keys = _episode_keys(self.seeds, Finetuning.COLLECT, number, 1)
+            return drifted(self.system, number).play(who, states, keys, explore=True)
+
+        return [rollout(number) for number in range(done, done + n)]
 
     def _updates(self, played: Sequence[Episode]) -> int | Array:
         """Gradient updates [n, M] after each of these rollouts; one number where all of them have their full length."""

@@ -170,3 +170,20 @@ def test_all_presets_are_possible(task):
     env = envs.make(task, "c")
     for name in gaps.presets(task):
         assert gaps.load(env, name).name == name
+
+
+def test_a_drift_of_sensors_is_a_table_of_entries(tmp_path):
+    gap = gaps.from_dict(ENV, "g", {"drift": {"xy": [0.001, -0.002]}})
+    file = tmp_path / "some.toml"
+    file.write_text(gaps.to_toml([gap]))
+    assert gaps.read_file(file) == {"g": gap} and gap.table["drift"] == gap.drift
+    plain = Gap("plain", {}, {})
+    np.testing.assert_allclose(gaps.drifts(ENV, [plain, gap]), [[0.0] * 4, [0.001, -0.002, 0.0, 0.0]])
+    assert gaps.drifts(ENV, [plain]) is None and "drift" not in plain.table
+    for table, words in (
+        ({"x": [0, 0]}, "gap 'g': 'drift' is a rate of 'obs_bias': .* there is no 'x'"),
+        ({"xy": [[0, 0], [1, 1]]}, "gap 'g': 'drift' needs numbers, not ranges"),
+        (3, "gap 'g': 'drift' must be a table of names and numbers, got 3"),
+    ):
+        with pytest.raises(UserError, match=words):
+            gaps.from_dict(ENV, "g", {"drift": table})

@@ -133,6 +133,26 @@ def rollouts(folder):
     return [store.load(i) for i in range(len(store))]
 
 
+def test_sensors_drift_from_rollout_to_rollout_also_of_a_run_that_goes_on(home, tmp_path, monkeypatch):
+    """By 100 m along x; evaluations after k rollouts see the system as it is then, and a system without drift none."""
+    (home / "drifting.toml").write_text("drift = { xy = [100.0, 0.0] }\n")
+    seen, evaluate = [], finetuning.evaluate
+
+    def evaluated(*args):
+        played = evaluate(*args)
+        seen.append(float(played.transitions.obs[..., 0].mean()))
+        return played
+
+    monkeypatch.setattr(finetuning, "evaluate", evaluated)
+    arguments = argv(home, "sac", "--rollouts", "2", out=tmp_path, reals=("drifting",))
+    for more in ([], ["--rollouts", "4", "--resume"]):
+        finetune.main([*arguments, *more])
+    made = rollouts(tmp_path / "finetune/toy/drifting/sac/seeds-0-1")
+    np.testing.assert_allclose([x["obs"][..., 0].mean() for x in made], [0, 100, 200, 300], atol=3)
+    np.testing.assert_allclose([x["obs"][..., 1].mean() for x in made], 0, atol=3)
+    np.testing.assert_allclose(seen, [0, 200, 200, 400, 400], atol=3)  # the last ones of a run: the best policies
+
+
 def killed(program, arguments):
     """Runs a program in a process of its own, which kills itself."""
     paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
