@@ -24,7 +24,7 @@ from envs.base import COMMANDS, Effects, Env, Numbers, Value, World
 from envs.files import parse_json, read_json, read_toml
 from envs.types import Array, Key, UserError, unknown
 
-__all__ = ["Gap", "changes", "each", "find", "from_dict", "load", "presets", "read_file", "title", "to_toml"]
+__all__ = ["Gap", "changes", "drifts", "each", "find", "from_dict", "load", "presets", "read_file", "title", "to_toml"]
 __all__ += ["usual", "worlds"]
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
