@@ -30,6 +30,7 @@ _FARTHEST = 1000.0
 COMMANDS: Mapping[str, float] = MappingProxyType(
     {"warp": 4.0, "warp_seed": 2.0**32 - 1, "dead_band": 1.0, "backlash": 10.0, "late": 3.0, "lost": 1.0}
 )
+WHOLE = frozenset({"warp_seed", "late"})  # of them, the whole numbers
 
 
 class Entry(NamedTuple):

@@ -1,16 +1,19 @@
 """Impure: distributions of gaps, read from TOML files, and drawing from them.
 
-A distribution is a TOML file with a table for each family of differences. A table holds items, domain parameters and
-effects by name, with what they are drawn from, uniformly:
+A distribution is a TOML file with a table for each family of differences. A table holds items, domain parameters,
+effects and errors of commands by name, with what they are drawn from, uniformly:
 
     latency = [0.0, 0.1]                                 one number; of a vector the same for all its axes
     action_bias = { each = [-0.3, 0.3] }                 a number for each axis of a vector
     action_scale = { common = [0.4, 1], each = [0.4, 1] }    either, at even odds
     obs_bias = { puck_xy = [-0.02, 0.02] }               a number for each axis of these entries, nothing for the others
     obs_bias = { puck_xy = { length = [0.005, 0.02] } }  a vector of that length in any direction, instead of a box
+    drift = { puck_xy = { length = [0.001, 0.002] } }    likewise, of the sensors' drift
+    scene = ["tilt+15", "patches-0"]                     one of these scenes
     together = true                                      all items of this family are drawn, not some of them
 
 A gap draws one to four of the families and of each of these one to all of its items, any number as likely as another.
+Where the file begins with `alone = true`, it has one family: gap i the i-th, and after the last the first again.
 """
 
 import zlib
@@ -21,8 +24,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+import envs
 from envs import gaps
-from envs.base import Effects, Entry, Env, Value, entries_of, misnamed
+from envs.base import COMMANDS, WHOLE, Effects, Entry, Env, Value, entries_of, misnamed
 from envs.files import read_toml
 from envs.gaps import Gap
 from envs.types import UserError, unknown
@@ -30,7 +34,8 @@ from envs.types import UserError, unknown
 MOST_FAMILIES = 4
 ATTEMPTS = 100  # to draw a gap that is possible
 DIGITS = 3  # that a drawn number keeps, so that a file says exactly what was drawn and a person can read it
-_COMMON, _EACH, _LENGTH, _TOGETHER = "common", "each", "length", "together"
+_COMMON, _EACH, _LENGTH, _TOGETHER, _ALONE = "common", "each", "length", "together", "alone"
+_DRIFT, _SCENE = "drift", "scene"
 
 
 class Range(NamedTuple):
@@ -41,16 +46,20 @@ class Range(NamedTuple):
     of_length: bool = False
 
 
-class Distribution(NamedTuple):
-    """Families by name; a family is items by name and how each is drawn: {how: range}.
+Item = Mapping[str, Range] | tuple[str, ...]
 
-    how: "common", "each" or an entry's name, see above. together: the families of which all items are drawn. source:
-    the file, for messages.
+
+class Distribution(NamedTuple):
+    """Families by name; a family is items by name and how each is drawn: {how: range}, or names of scenes.
+
+    how: "common", "each" or an entry's name, see above. together: the families of which all items are drawn. alone:
+    whether a gap has one family. source: the file, for messages.
     """
 
     source: str
-    families: Mapping[str, Mapping[str, Mapping[str, Range]]]
+    families: Mapping[str, Mapping[str, Item]]
     together: frozenset[str]
+    alone: bool = False
 
 
 def load(env: Env, path: Path | None = None) -> Distribution:
@@ -60,7 +69,8 @@ def load(env: Env, path: Path | None = None) -> Distribution:
     if path is None and not file.is_file():
         raise UserError(f"{env.name} comes with no distribution of gaps; name a file of one")
     tables = read_toml(str(file))
-    if not tables:
+    alone = _flag(tables, _ALONE, source)
+    if not (tables := {family: table for family, table in tables.items() if family != _ALONE}):
         raise UserError(f"{source}: has no family; write a table for each, with items and their ranges")
     families, together = {}, set()
     for family, table in tables.items():
@@ -68,10 +78,14 @@ def load(env: Env, path: Path | None = None) -> Distribution:
         if not items:
             raise UserError(f"{source}: '{family}' must be a table of items and their ranges, got {table!r}")
         families[family] = {name: _item(env, name, ranges, f"{source} [{family}]") for name, ranges in items.items()}
-        if not isinstance(whole := table.get(_TOGETHER, False), bool):
-            raise UserError(f"{source} [{family}]: '{_TOGETHER}' must be true or false, got {whole!r}")
-        together |= {family} if whole else set()
-    return Distribution(source, families, frozenset(together))
+        together |= {family} if _flag(table, _TOGETHER, f"{source} [{family}]") else set()
+    return Distribution(source, families, frozenset(together), alone)
+
+
+def _flag(table: Mapping[str, Any], name: str, where: str) -> bool:
+    if not isinstance(flag := table.get(name, False), bool):
+        raise UserError(f"{where}: '{name}' must be true or false, got {flag!r}")
+    return flag
 
 
 def draw(env: Env, distribution: Distribution, seed: int, n: int) -> list[Gap]:
@@ -87,21 +101,23 @@ def _possible(env: Env, distribution: Distribution, seed: int, number: int) -> G
     name, refused = f"{env.name}-{seed}-{number:02d}", None
     for _ in range(ATTEMPTS):
         try:
-            return gaps.from_dict(env, name, _table(env, distribution, rng))
+            return gaps.from_dict(env, name, _table(env, distribution, rng, number))
         except UserError as error:
             refused = error
     raise UserError(f"{distribution.source}: {ATTEMPTS} gaps drawn in a row are impossible; the last: {refused}")
 
 
-def _table(env: Env, distribution: Distribution, rng: np.random.Generator) -> dict[str, Any]:
+def _table(env: Env, distribution: Distribution, rng: np.random.Generator, number: int) -> dict[str, Any]:
     """A gap as a file would hold it."""
-    chosen = _some(rng, list(distribution.families), MOST_FAMILIES)
-    table: dict[str, Any] = {"families": chosen, "params": {}, "effects": {}}
+    families = list(distribution.families)
+    chosen = [families[number % len(families)]] if distribution.alone else _some(rng, families, MOST_FAMILIES)
+    table: dict[str, Any] = {"families": chosen, "params": {}, "effects": {}, "commands": {}}
     for family in chosen:
         items = distribution.families[family]
         for name in list(items) if family in distribution.together else _some(rng, list(items), len(items)):
-            kind = "effects" if name in Effects._fields else "params"
-            table[kind][name] = _value(rng, items[name], entries_of(env, name))
+            value = _value(rng, name, items[name], entries_of(env, "obs_bias" if name == _DRIFT else name))
+            kind = "effects" if name in Effects._fields else "commands" if name in COMMANDS else "params"
+            (table if name in (_DRIFT, _SCENE) else table[kind])[name] = value
     return table
 
 
@@ -111,8 +127,12 @@ def _some(rng: np.random.Generator, names: list[str], most: int) -> list[str]:
     return [names[i] for i in sorted(rng.choice(len(names), count, replace=False))]
 
 
-def _value(rng: np.random.Generator, ways: Mapping[str, Range], entries: tuple[Entry, ...]) -> Value:
+def _value(rng: np.random.Generator, name: str, ways: Item, entries: tuple[Entry, ...]) -> Value | str:
     """What a gap says of an item."""
+    if not isinstance(ways, Mapping):
+        return ways[rng.integers(len(ways))]
+    if name in WHOLE:
+        return int(rng.integers(int(ways[_COMMON].low), int(ways[_COMMON].high), endpoint=True))
     if not set(ways) & {_COMMON, _EACH}:
         sizes = {e.name: e.size for e in entries}
         return {name: _numbers(rng, ranges, sizes[name]) for name, ranges in ways.items()}
@@ -129,18 +149,29 @@ def _numbers(rng: np.random.Generator, bounds: Range, size: int) -> float | list
     return rounded if size > 1 else rounded[0]
 
 
-def _item(env: Env, name: str, table: Any, where: str) -> dict[str, Range]:
+def _item(env: Env, name: str, table: Any, where: str) -> Item:
     """How an item is drawn. Raises UserError for an unknown name and for what is no range."""
-    if name not in Effects._fields and name not in [p.name for p in env.parameters]:
+    if name == _SCENE:
+        return _scenes(env, table, where)
+    if name not in (*Effects._fields, *COMMANDS, _DRIFT, *(p.name for p in env.parameters)):
         raise UserError(f"{where}: {misnamed(env, name)}")
-    ways, entries = table if isinstance(table, dict) else {_COMMON: table}, [e.name for e in entries_of(env, name)]
-    allowed = [_COMMON, *([_EACH, *entries] if entries else [])]
+    ways = table if isinstance(table, dict) else {_COMMON: table}
+    entries = [e.name for e in entries_of(env, "obs_bias" if name == _DRIFT else name)]
+    allowed = entries if name == _DRIFT else [_COMMON, *([_EACH, *entries] if entries else [])]
     for way in ways:
         if way not in allowed:
             raise UserError(f"{where} {unknown(name, way, allowed)}")
     if not ways or (set(ways) & {_COMMON, _EACH} and set(ways) & set(entries)):
         raise UserError(f"{where}: '{name}' needs ranges of '{_COMMON}' and '{_EACH}', or of entries, got {table!r}")
     return {way: _range(ends, f"{where}: '{name}'", named=way in entries) for way, ends in ways.items()}
+
+
+def _scenes(env: Env, names: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise UserError(f"{where}: 'scene' needs a list of names, got {names!r}")
+    for name in names:
+        envs.scene(env.name, name)
+    return tuple(names)
 
 
 def _range(table: Any, where: str, *, named: bool) -> Range:

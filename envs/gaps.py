@@ -20,7 +20,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from envs import extend
-from envs.base import COMMANDS, Effects, Env, Numbers, Value, World
+from envs.base import COMMANDS, WHOLE, Effects, Env, Numbers, Value, World
 from envs.files import parse_json, read_json, read_toml
 from envs.types import Array, Key, UserError, unknown
 
@@ -257,7 +257,7 @@ def _check_commands(where: str, values: Mapping[str, Any]) -> None:
     for name, value in values.items():
         if name not in COMMANDS:
             raise UserError(f"{where}: {unknown("error of 'commands'", name, COMMANDS)}")
-        whole = name in ("late", "warp_seed")
+        whole = name in WHOLE
         if not isinstance(value, int | float) or not 0 <= value <= COMMANDS[name] or (whole and value != int(value)):
             number = "a whole number" if whole else "one number"
             raise UserError(f"{where}: '{name}' must be {number} from 0 to {COMMANDS[name]:.10g}, got {value}")

@@ -45,8 +45,9 @@ class DrawArgs(MeasureArgs):
     judge_preset: str = PLAIN
     """Pretraining preset of that training; --config.* changes it."""
     choose: int = 0
-    """Choose so many of the measured gaps for a frozen set, evenly over strata and families. A gap that a policy
-    trained there (--judge) did not master is never chosen."""
+    """Choose so many of the measured gaps for a frozen set, evenly over strata and families; where gaps have one family
+    each, as many of every family, at most a quarter solved if the others suffice. A gap that a policy trained there
+    (--judge) did not master is never chosen."""
     to: Path | None = None
     """With --choose: the .toml file of the frozen set; one that holds other gaps is never replaced."""
     overwrite: bool = False
@@ -108,7 +109,8 @@ def _freeze(args: DrawArgs, path: Path, drawn: Sequence[Gap], known: Lines, mark
     """Writes a frozen set of the gaps that were asked for and says what is to know of it."""
     by_name = {gap.name: gap for gap in drawn}
     lines = {name: known[name] for name in by_name}
-    names = choose(lines, args.choose)
+    alone = all(len(gap.families) == 1 for gap in drawn)
+    names = choose_alone(lines, args.choose) if alone else choose(lines, args.choose)
     words = [", ".join([f"zero-shot {100 * lines[n]['zero_shot']['success']:.0f} %", *marks[n]]) for n in names]
     chosen = [by_name[name]._replace(stratum=lines[name]["stratum"]) for name in names]
     write(path, chosen, words, _command(args))
@@ -144,6 +146,25 @@ def choose(lines: Lines, n: int) -> list[str]:
             chosen.add(best)
             for family in families[best]:
                 counts[family] += 1
+    return [name for name in lines if name in chosen]
+
+
+def choose_alone(lines: Lines, n: int) -> list[str]:
+    """The same of gaps that have one family each: as many of every family, of these a quarter solved, if there are
+    enough others, else more; the first ones. Raises UserError if a family has too few gaps.
+    """
+    may = [name for names in _by_stratum(lines).values() for name in names]
+    of = {name: lines[name]["gap"]["families"][0] for name in lines if name in may}
+    share, chosen = n // max(len(set(of.values())), 1), set[str]()
+    for family in sorted(set(of.values())):
+        solved, open_ = (
+            [x for x in of if of[x] == family and (lines[x]["stratum"] == "solved") is s] for s in (True, False)
+        )
+        least = share - share // 4
+        order = [*open_[:least], *solved[: share // 4], *open_[least:], *solved[share // 4 :]]
+        if len(order) < share:
+            raise UserError(f"--choose {n}: {family} has {len(order)} gaps of {share}; draw more with --count")
+        chosen |= set(order[:share])
     return [name for name in lines if name in chosen]
 
 

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import envs
 from envs import gap_distribution, gaps
 from envs.base import Env
+from envs.effects import make_range
 from envs.files import read_json
 from envs.gaps import SIM, Gap
 from envs.observations import concealed, with_previous_actions
-from envs.rollout import Episode
+from envs.rollout import Episode, real_env
 from envs.types import Key, PyTree, Transition, UserError
 from experiments.runner.cli import columns
 from experiments.runner.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 SOLVED_AT_LEAST, FAILED_BELOW, TRIVIAL_AT_LEAST, ADMITTED_AT_LEAST = 0.8, 0.2, 0.9, 0.9
 PLANNER = "sgft-mpc"
+HALF = 10  # rollouts
 PREVIOUS_ACTIONS = 2  # that the judge sees: a command that comes late is still in force, or was when the step began
 _ROLLOUT_SEED = 2**31 + 6  # of the rollouts that distortions are fitted to
 _MEASURED = {"zero_shot": ("zero_shot", "fit"), "plan": ("plan",), "judge": ("judge",)}  # of a line, by measurement
@@ -55,15 +57,30 @@ def run(args: "DrawArgs", seeds: list[int], folders: list[Path]) -> tuple[list[G
     table = Table(path.with_suffix(".json"), {"task": task, "seed": args.seed}, everywhere)
     for what, settings in _settings(env, args, priors, seeds).items():
         table.settle(what, settings, again=args.overwrite)
-    if missing := [gap for gap in table.without("zero_shot", everywhere) if gap.name != SIM]:
+    for missing in _together(env, [gap for gap in table.without("zero_shot", everywhere) if gap.name != SIM]):
         table.add(_zero_shot(env, missing, priors, args.episodes))
-    if args.plan and (missing := table.without("plan", everywhere)):
+    for missing in _together(env, table.without("plan", everywhere) if args.plan else []):
         table.add(_plan(env, missing, priors, args.episodes))
-    if args.judge and (missing := table.to_judge(drawn)):
-        table.add(_judge(env, args, missing, seeds, path.with_suffix("")))
+    for missing in _together(env, table.to_judge(drawn) if args.judge else []):
+        table.add(_judge(env, args, missing, seeds, path.with_suffix("") / missing[0].scene))
     print("\n".join(lines([gap.name for gap in everywhere], table.known)))
     print(f"gaps: {path}\ntable: {table.path}")
     return drawn, table.content
+
+
+def _together(env: Env, drawn: Sequence[Gap]) -> list[list[Gap]]:
+    """The gaps of each scene, as they are halfway where sensors drift: one program plays those of one scene."""
+    scenes = dict.fromkeys(gap.scene for gap in drawn)
+    return [[_halfway(env, gap) for gap in drawn if gap.scene == scene] for scene in scenes]
+
+
+def _halfway(env: Env, gap: Gap) -> Gap:
+    """The gap after half of a frozen test's rollouts."""
+    if (rate := gaps.drifts(env, [gap])) is None:
+        return gap
+    ends = make_range(env, {"obs_bias": gap.effects.get("obs_bias", 0.0)})
+    bias: Any = [(end.obs_bias + HALF * rate[0]).tolist() for end in ends]
+    return gap._replace(effects={**gap.effects, "obs_bias": bias}, drift={})
 
 
 def write_gaps(path: Path, drawn: Sequence[Gap]) -> None:
@@ -192,8 +209,12 @@ def marks(line: Mapping[str, Any]) -> list[str]:
 
 
 def _zero_shot(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) -> Lines:
-    """Success of the priors' policies on gaps and without one, as they are and after one rollout of identification."""
-    everywhere = [gaps.find(env.name, SIM), *drawn]
+    """Success of the priors' policies on gaps and without one, as they are and after one rollout of identification.
+
+    Of gaps in a scene of their own only as they are: identification compares with the simulator, in one program.
+    """
+    scene = drawn[0].scene
+    everywhere = [gaps.find(env.name, SIM)._replace(scene=scene), *drawn]
     system, members = systems(env, everywhere, priors, episodes)
     policy = make_policy(priors[0].card, env)
     count = len(everywhere) * len(priors)
@@ -204,6 +225,8 @@ def _zero_shot(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: in
         return _rates(played, len(everywhere), len(priors))
 
     plain = rates(nothing)
+    if scene:
+        return {gap.name: {"zero_shot": success} for gap, success in zip(drawn, plain[1:], strict=True)}
     keys = jnp.broadcast_to(jax.random.split(episode_key(_ROLLOUT_SEED), _SIMULATED), (count, _SIMULATED))
     explored = system.play(policy, members._replace(distortion=nothing), keys, explore=True)
     part = command_interface(network_of(priors[0].card), env)
@@ -250,7 +273,8 @@ def _plan(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) ->
 def _judge(env: Env, args: "DrawArgs", drawn: Sequence[Gap], seeds: list[int], folder: Path) -> Lines:
     """Success of policies that were trained on the gaps themselves and see their previous actions."""
     seen = env if env.previous_actions else with_previous_actions(env, PREVIOUS_ACTIONS)
-    played = train(env, args.config, drawn, seeds, folder, episodes=args.episodes, seen=seen)
+    world, seen = real_env(env, drawn), real_env(seen, drawn)
+    played = train(world, args.config, drawn, seeds, folder, episodes=args.episodes, seen=seen)
     return {gap.name: {"judge": rate(episodes, stats.mean)} for gap, episodes in zip(drawn, played, strict=True)}
 
 

@@ -2,6 +2,7 @@
 
 import tomllib
 from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +10,9 @@ import toy
 
 import envs
 from envs import gap_distribution, gaps
-from envs.base import Effects
+from envs.base import COMMANDS, Effects
 from envs.types import UserError
+from sgft_jax.posterior.candidates import unknowns_of
 
 ENV = toy.make()
 TEXT = """
@@ -100,10 +102,58 @@ def test_what_is_impossible_is_drawn_again(distribution):
         gap_distribution.draw(never, distribution, 0, 1)
 
 
+ALONE = """
+alone = true
+[late]
+late = [1, 2]
+lost = [0.3, 0.7]
+[off]
+drift = { xy = { length = [0.01, 0.02] } }
+[warped]
+together = true
+warp = [0.5, 1.0]
+warp_seed = [0, 99999]
+"""
+
+
+def test_errors_of_commands_and_drifts_are_drawn_alone_in_turn(tmp_path):
+    env = ENV._replace(workspace=((-1.0, 1.0), (-1.0, 1.0)))
+    drawn = gap_distribution.draw(env, gap_distribution.load(env, write(tmp_path, ALONE)), 0, 30)
+    assert [gap.families for gap in drawn] == [("late",), ("off",), ("warped",)] * 10
+    late, off, warped = drawn[::3], drawn[1::3], drawn[2::3]
+    assert {gap.commands.get("late") for gap in late} == {None, 1, 2} and all(not gap.effects for gap in drawn)
+    assert all(0.0099 < np.linalg.norm(gap.drift["xy"]) < 0.0201 for gap in off)
+    assert all(set(gap.commands) == {"warp", "warp_seed"} for gap in warped)
+    assert len({gap.commands["warp_seed"] for gap in warped}) == 10
+    assert list(gaps.read_file(write(tmp_path, gaps.to_toml(drawn))).values()) == drawn
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_what_no_parameter_explains_is_none_of_the_unknowns_that_are_looked_for(task):
+    """Nor is it a gap of before; scenes are drawn too."""
+    env = envs.make(task, "c")
+    file = resources.files("envs") / "gaps/distributions" / f"{task}-unexplained.toml"
+    distribution = gap_distribution.load(env, Path(str(file)))
+    drawn = gap_distribution.draw(env, distribution, 0, 40)
+    assert all(not gap.params and not gap.effects and (gap.commands or gap.drift or gap.scene) for gap in drawn)
+    names = {name for gap in drawn for name in gap.commands}
+    assert names == {*COMMANDS} and not names & {unknown.name for unknown in unknowns_of(env)}
+    assert len({gap.scene for gap in drawn}) > 2
+    folder = resources.files("envs") / "gaps"
+    development = list(gaps.read_file(folder / f"development/{task}-unexplained.toml").values())
+    assert [gap._replace(stratum="") for gap in development] == gap_distribution.draw(env, distribution, 4, 8)
+    candidates = list(gaps.read_file(folder / f"test/candidates/{task}.toml").values())
+    assert candidates == gap_distribution.draw(env, distribution, 5, 32)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", "has no family"),
+        ("alone = true", "has no family"),
+        ("alone = 3\n[a]\nmass = [1, 2]", "own.toml: 'alone' must be true or false, got 3"),
+        ("[a]\nscene = 3", r"own.toml \[a\]: 'scene' needs a list of names, got 3"),
+        ("[a]\ndrift = [1, 2]", "drift: there is no 'common'. Choose from: velocity, xy"),
         ("mass = [1, 2]", "'mass' must be a table of items"),
         (
             "[a]\nmas = [1, 2]",
@@ -173,4 +223,4 @@ def test_drawn_sensors_and_delays_are_possible_and_no_better_than_simulated(task
 
 def test_every_distribution_is_that_of_a_task():
     files = (resources.files("envs") / "gaps" / "distributions").iterdir()
-    assert {file.name for file in files} == {f"{task}.toml" for task in SHIPPED}
+    assert {file.name for file in files} == {f"{task}{kind}.toml" for task in SHIPPED for kind in ("", "-unexplained")}

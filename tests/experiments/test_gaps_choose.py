@@ -53,6 +53,18 @@ def test_families_are_covered_as_evenly_as_the_strata_allow():
     assert gaps_draw.choose({**lines, "a": line("solved", "y")}, 3) == ["a", "d", "g"]
 
 
+def test_of_gaps_with_one_family_each_as_many_of_every_family_three_quarters_open_where_there_are():
+    strata = {"s": "solved", "p": "partial", "f": "failed"}
+
+    def family(name, letters, admitted=None):
+        return {f"{name}{i}": line(strata[x], name, admitted=admitted) for i, x in enumerate(letters)}
+
+    lines = family("a", "ssfppp") | family("b", "sssps") | family("c", "fffff") | family("c", "f", admitted=False)
+    assert " ".join(gaps_draw.choose_alone(lines, 12)) == "a0 a2 a3 a4 b0 b1 b2 b3 c1 c2 c3 c4"
+    with pytest.raises(UserError, match="--choose 15: c has 4 gaps of 5"):
+        gaps_draw.choose_alone(lines, 15)
+
+
 def test_gaps_that_nobody_mastered_or_measured_and_sim_are_never_chosen():
     lines = {
         "sim": line("solved", admitted=True),

@@ -6,12 +6,15 @@ import re
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+import toy_steps
 from priors_by_hand import save_prior
 
 import envs
 from envs import gap_distribution, gaps
 from envs.files import read_json
+from envs.gaps import Gap
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.studies import gaps_draw as command
@@ -84,7 +87,7 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
     assert found["sim"]["stratum"] == "solved" and found["sim"]["zero_shot"]["success"] > 0.95
     for gap in drawn:
         line = found[gap.name]
-        assert gaps_drawn.jsonable(gap) == line["gap"] and len(line["zero_shot"]["policies"]) == 2
+        assert gaps_drawn.jsonable(gap.table) == line["gap"] and len(line["zero_shot"]["policies"]) == 2
         turned = "actuation" in gap.families  # the hand comes half the way in the time there is
         assert line["stratum"] == ("failed" if turned else "solved")
         assert line["fit"]["success"] > 0.9 and line["trivial"] is True
@@ -138,6 +141,16 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
     with pytest.raises(SystemExit):
         call(home, "--count", "4")
     assert "seed-5.json: its toy_steps-5-00 is another gap; choose another --out" in capsys.readouterr().err
+
+
+def test_gaps_are_measured_scene_by_scene_and_halfway_through_a_drift():
+    env = toy_steps.make()
+    plain, other = Gap("plain", {}, {}), Gap("other", {}, {}, scene="else")
+    off = Gap("off", {}, {"obs_bias": {"goal": [1.0, 0.0]}}, drift={"goal": [0.0, 0.01]})
+    groups = gaps_drawn._together(env, [plain, other, off])
+    assert [[gap.name for gap in group] for group in groups] == [["plain", "off"], ["other"]]
+    assert groups[0][0] is plain and not groups[0][1].drift
+    np.testing.assert_allclose(groups[0][1].effects["obs_bias"], [[1, 0.1, 0, 0]] * 2, atol=1e-6)
 
 
 @pytest.mark.slow
