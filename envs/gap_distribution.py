@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import envs
 from envs import gaps
 from envs.base import COMMANDS, WHOLE, Effects, Entry, Env, Value, entries_of, misnamed
 from envs.files import read_toml
@@ -152,7 +151,9 @@ def _numbers(rng: np.random.Generator, bounds: Range, size: int) -> float | list
 def _item(env: Env, name: str, table: Any, where: str) -> Item:
     """How an item is drawn. Raises UserError for an unknown name and for what is no range."""
     if name == _SCENE:
-        return _scenes(env, table, where)
+        if not isinstance(table, list) or not table or not all(isinstance(scene, str) for scene in table):
+            raise UserError(f"{where}: 'scene' needs a list of names, got {table!r}")
+        return tuple(table)
     if name not in (*Effects._fields, *COMMANDS, _DRIFT, *(p.name for p in env.parameters)):
         raise UserError(f"{where}: {misnamed(env, name)}")
     ways = table if isinstance(table, dict) else {_COMMON: table}
@@ -164,14 +165,6 @@ def _item(env: Env, name: str, table: Any, where: str) -> Item:
     if not ways or (set(ways) & {_COMMON, _EACH} and set(ways) & set(entries)):
         raise UserError(f"{where}: '{name}' needs ranges of '{_COMMON}' and '{_EACH}', or of entries, got {table!r}")
     return {way: _range(ends, f"{where}: '{name}'", named=way in entries) for way, ends in ways.items()}
-
-
-def _scenes(env: Env, names: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise UserError(f"{where}: 'scene' needs a list of names, got {names!r}")
-    for name in names:
-        envs.scene(env.name, name)
-    return tuple(names)
 
 
 def _range(table: Any, where: str, *, named: bool) -> Range:
