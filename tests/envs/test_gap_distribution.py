@@ -144,6 +144,7 @@ def test_what_no_parameter_explains_is_none_of_the_unknowns_that_are_looked_for(
     assert [gap._replace(stratum="") for gap in development] == gap_distribution.draw(env, distribution, 4, 8)
     candidates = list(gaps.read_file(folder / f"test/candidates/{task}.toml").values())
     assert candidates == gap_distribution.draw(env, distribution, 5, 32)
+    assert all(envs.scene(task, gap.scene) for gap in [*development, *candidates])
 
 
 @pytest.mark.parametrize(
