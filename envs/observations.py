@@ -125,16 +125,22 @@ def varying(
 
     params, effects: as in `envs.domains`. Raises UserError where nothing varies.
     """
+    if not (entries := all_varying(env, params, effects)):
+        raise UserError(f"{env.name}: no parameter and no effect varies; name a domain with --real FILE:NAME")
+    return entries
+
+
+def all_varying(
+    env: Env, params: Mapping[str, Value] = NOTHING, effects: Mapping[str, Value] = NOTHING
+) -> tuple[Varying, ...]:
+    """The same; () where nothing varies."""
     low, high = parameter_ranges(env, params).T
     ends = make_range(env, {**env.training, **effects})
     low, high = (
         np.concatenate([ranges, *(np.ravel(x) for x in end)]) for ranges, end in ((low, ends.low), (high, ends.high))
     )
     named = zip(_names(env), low, high, strict=True)
-    entries = tuple(Varying(*name, float(a), float(b)) for name, a, b in named if a < b)
-    if not entries:
-        raise UserError(f"{env.name}: no parameter and no effect varies; name a domain with --real FILE:NAME")
-    return entries
+    return tuple(Varying(*name, float(a), float(b)) for name, a, b in named if a < b)
 
 
 def with_system(env: Env, system: tuple[Varying, ...]) -> Env:

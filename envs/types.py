@@ -56,7 +56,8 @@ class Policy(NamedTuple):
     """How the parameters of a prior act, for one example.
 
     init_carry() -> carry. act(params, carry, obs, key, *, explore) -> (action, carry); `explore` may be traced.
-    value(params, obs) -> []: V_sim, deterministic; None where an observation does not decide the value.
+    value(params, obs) -> []: V_sim, deterministic; None where an observation does not decide the value. Those of SAC
+        take the system, too, see `models.value.make_v_sim`.
     model_error(params, obs [T + 1, obs_dim], actions [T, act_dim]) -> [T]: how far its model drifts from a trajectory,
         in standard deviations of the observation; None where the model does not predict observations.
     log_prob(params, obs, action) -> []: log density of an exploring action; None where it has none, or nobody wrote it.
@@ -64,6 +65,6 @@ class Policy(NamedTuple):
 
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
-    value: Callable[[PyTree, Array], Array] | None = None
+    value: Callable[..., Array] | None = None
     model_error: Callable[[PyTree, Array, Array], Array] | None = None
     log_prob: Callable[[PyTree, Array, Array], Array] | None = None

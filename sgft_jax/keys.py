@@ -20,6 +20,7 @@ class Pretraining(IntEnum):
     RANDOM = 1
     START = 2
     REPORT = 3
+    VALUE = 4
 
 
 class Finetuning(IntEnum):

@@ -155,7 +155,7 @@ def make_act(
     sum_t gamma^t r_t + gamma^H V_sim(s_H). Source: SGFT equation (1) but for V_sim(s_0), which is the same for all.
     """
     actor = networks.make_actor(config.obs_dim, config.act_dim, config.network)
-    value_net = networks.make_value(config.obs_dim, config.network)
+    value_net = value.make_v_sim(config.obs_dim, config.network)
     model = networks.make_dynamics(config.obs_dim, config.act_dim, config.network)
     search = MPPIConfig(config.samples, config.samples // _ELITES, _ITERATIONS)
 

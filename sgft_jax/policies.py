@@ -26,7 +26,7 @@ Head = Literal["affine", "gaussian", "deterministic"]
 def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
     """Actor, V_sim and dynamics ensemble of `SACParams`."""
     actor = networks.make_actor(obs_dim, act_dim, network)
-    value_net = networks.make_value(obs_dim, network)
+    value_net = value.make_v_sim(obs_dim, network)
     model = networks.make_dynamics(obs_dim, act_dim, network)
 
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
@@ -42,7 +42,7 @@ def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
     return Policy(
         init_carry=lambda: (),
         act=act,
-        value=lambda params, obs: value.predict(value_net, params.value, params.normalizer, obs),
+        value=lambda params, obs, system=None: value.predict(value_net, params.value, params.normalizer, obs, system),
         model_error=lambda params, obs, actions: dynamics.rollout_error(
             model, params.dynamics, params.normalizer, obs, actions
         ),

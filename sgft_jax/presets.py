@@ -80,7 +80,14 @@ class PretrainConfig(checks.Checked):
     policy_delay: checks.Few = 1
     """Critic updates of SAC per actor update."""
     ensemble_size: checks.Few = 5
-    """Dynamics models that SAC trains alongside."""
+    """Dynamics models that SAC trains alongside, and networks of V_sim."""
+    value_episodes: checks.Count = 32_768
+    """Simulated episodes that V_sim is fitted to, after training. They begin with random actions."""
+    value_updates: checks.Count = 12_000
+    """Gradient steps of that fit, with batches of `batch_size` steps."""
+    value_left: Annotated[float, checks.positive, checks.share] = 0.1
+    """Share of the discounted weight that is left where these episodes end, past their time limit; there V_sim itself
+    stands for what follows."""
     precision: Precision = "default"
     """Matrix products of the updates on GPUs. V_sim is always evaluated in float32."""
     size: str = "5M"
@@ -231,6 +238,9 @@ PRESETS: dict[str, PretrainConfig] = {
         alpha=0.1,
         network=NetworkConfig(hidden=(96, 96), layer_norm=True),
         ensemble_size=3,
+        value_episodes=768,
+        value_updates=4000,
+        value_left=0.3,
         chunk_steps=100,
         eval_every=1,
         eval_episodes=32,

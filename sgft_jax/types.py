@@ -98,7 +98,7 @@ class Normalizer(NamedTuple):
 class Imagination(NamedTuple):
     """What transforms may ask about the world: closures over the current fine-tuning state, for ONE example.
 
-    value(obs) -> []: the frozen, deterministic V_sim; of SAC's priors with the entropy bonus of later steps.
+    value(obs) -> []: the frozen, deterministic V_sim.
     policy(obs, context, key) -> [act_dim]: a sample of the current policy. context: None or [context_dim].
     dynamics(obs, action, key) -> [obs_dim]: one predicted successor.
     reward(obs, action, next_obs) -> []: the task's reward. terminated(obs, action, next_obs) -> [] bool.

@@ -23,7 +23,7 @@ def build(config: Config, task: Task) -> HybridAgent:
     from sgft_jax.data import sources
     from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
 
-    structure = SACConfig(task.obs_dim, task.act_dim, config.network, train_value=False, train_dynamics=False)
+    structure = SACConfig(task.obs_dim, task.act_dim, config.network, train_dynamics=False)
     batches = sources.two_buffers(config.rows, config.rows)
     return agent_of(make_sac(structure, SACHyper.chosen(config)), config, task, batches, simulates=True)
 

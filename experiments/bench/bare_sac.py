@@ -41,7 +41,6 @@ class Bare(NamedTuple):
     critic: Trained
     target: PyTree
     log_alpha: Trained
-    value: Trained
     dynamics: Trained
 
 
@@ -55,7 +54,6 @@ def init(key: Key, config: NetworkConfig, obs_dim: int, act_dim: int, *, members
         critic=trained(critic),
         target=jax.tree.map(jnp.copy, critic),
         log_alpha=trained(jnp.log(jnp.float32(alpha))),
-        value=trained(layers(keys[2], obs_dim, 1, config.hidden, layer_norm=norm)),
         dynamics=trained(layers(keys[3], obs_dim + act_dim, obs_dim, config.hidden, layer_norm=False, stack=members)),
     )
 
@@ -81,26 +79,21 @@ def update(agent: Bare, batch: Transition, noise: Noise, hyper: SACHyper) -> Bar
     critic = adam(agent.critic, jax.grad(critic_loss)(agent.critic.params), hyper.lr_critic)
     average = jax.tree.map(lambda old, new: old + hyper.tau * (new - old), agent.target, critic.params)
 
-    def actor_loss(params: PyTree) -> tuple[Array, tuple[Array, Array]]:
+    def actor_loss(params: PyTree) -> tuple[Array, Array]:
         action, log_prob = _sample(params, batch.obs, noise.actor)
         q = forward(critic.params, jnp.concatenate([batch.obs, action], axis=1))[..., 0].min(0)
-        return jnp.mean(alpha * log_prob - q), (q, log_prob)
+        return jnp.mean(alpha * log_prob - q), log_prob
 
-    grads, (q, log_prob) = jax.grad(actor_loss, has_aux=True)(agent.actor.params)
+    grads, log_prob = jax.grad(actor_loss, has_aux=True)(agent.actor.params)
     actor = adam(agent.actor, grads, hyper.lr_actor)
     log_alpha = temperature(agent.log_alpha, log_prob, hyper.entropy_per_dim * act_dim, hyper.lr_alpha)
-
-    def value_loss(params: PyTree) -> Array:
-        return jnp.mean((forward(params, batch.obs)[:, 0] - q) ** 2)
-
-    value = adam(agent.value, jax.grad(value_loss)(agent.value.params), hyper.lr_value)
 
     def dynamics_loss(params: PyTree) -> Array:
         errors = jnp.mean((forward(params, both) - (batch.next_obs - batch.obs)) ** 2, axis=-1)
         return jnp.sum(jnp.mean(noise.bootstrap.T * errors, axis=1))
 
     dynamics = adam(agent.dynamics, jax.grad(dynamics_loss)(agent.dynamics.params), hyper.lr_dynamics)
-    return Bare(actor, critic, average, log_alpha, value, dynamics)
+    return Bare(actor, critic, average, log_alpha, dynamics)
 
 
 def temperature(log_alpha: Trained, log_prob: Array, entropy: float | Array, rate: Any) -> Trained:

@@ -67,7 +67,7 @@ def speed(
 def plain_speed(batch: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
     """Updates per second of plain SAC, drawing its batches included: ours, and of libraries that are installed."""
     network = NetworkConfig(hidden=(width, width))
-    learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=network, train_value=False, train_dynamics=False))
+    learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=network, train_dynamics=False))
     buffer = replay.add_batch(replay.init(replay.blank(OBS_DIM, ACT_DIM), REPLAY), rows(jax.random.key(0), REPLAY))
 
     def run(agent: PyTree, buffer: replay.ReplayState, key: Key) -> PyTree:

@@ -20,19 +20,19 @@ from envs import gaps, mesh
 from envs.base import Env, World
 from envs.domains import with_actuators
 from envs.gaps import SIM, Gap
-from envs.observations import blurred, varying, with_system
+from envs.observations import all_varying, blurred, varying, with_system
 from envs.rollout import Episode, heldout_worlds, load_gap, pool_size, real_env, training_worlds
-from envs.types import PyTree
+from envs.types import Key, PyTree
 from experiments.runner.ahead import Ahead, compiling
 from experiments.runner.cli import as_typed
 from experiments.runner.machines import folder_of_host, join_hosts, reserve
 from experiments.runner.options import command
 from experiments.runner.pictures import film_episode
 from experiments.runner.progress import doing
-from experiments.runner.report import Report, make_report, numbers
+from experiments.runner.report import Report, make_judges, make_report, numbers, value_numbers
 from experiments.runner.training import Record, Training, best_of, describe, opened, play, scores
 from sgft_jax import stacking
-from sgft_jax.algorithms import make_policy
+from sgft_jax.algorithms import make_policy, recipe_of
 from sgft_jax.analysis import figures
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io import checkpoint, runs
@@ -41,8 +41,9 @@ from sgft_jax.io.priors import digest
 from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.methods import DEFAULT, all_methods
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import evidence, pretraining
+from sgft_jax.train import evidence, pretraining, value_fit
 from sgft_jax.train.fleet import FleetState
+from sgft_jax.train.value_fit import Held
 from sgft_jax.types import Prior
 
 if TYPE_CHECKING:
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 
 _CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
 _HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
+_VALUE_SEED, _STATES = 2**31 + 2, 64  # of the worlds that V_sim is measured in; states that are played again, at most
 
 
 # One program instead of one for every field.
@@ -131,14 +133,18 @@ class _Run(Training):
         size = self.config.chunk_env_steps
         every = {"eval_every": self.config.eval_every * size, "checkpoint_every": self.config.checkpoint_every * size}
         super().__init__(f"pretrain {env.name}", self.config.chunks * size, len(record.seeds), **every)
-        self.card = pretraining.prior_card(env, self.config)
+        system = all_varying(env, gap.params, gap.effects) if gap else all_varying(env)
+        self.card = pretraining.prior_card(env, self.config, system)
         self.policy = make_policy(self.card, env)
         self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
         self.shapes = functools.cache(self._shapes)
         self.programs = pretraining.make_programs(env, self.config, len(self.seeds))
         measure = functools.partial(make_report, env, self.policy, gamma=self.config.gamma)
         self.measure = jax.jit(jax.vmap(functools.partial(measure, trajectories=self.config.eval_episodes)))
-        self.reports = args.report and self.policy.value is not None
+        self.reports, self.fits = args.report and self.policy.value is not None, recipe_of(env, self.config).valued
+        self.fit = pretraining.make_value_program(env, self.config, system, self.card, len(self.seeds))
+        known, n = system if self.fits else (), self.config.report_episodes
+        self.judges = make_judges(env, known, self.policy, self.config.gamma, episodes=n, members=len(self.seeds))
         self.best: evidence.Best | None = None
 
     def work(self) -> dict[str, Any]:
@@ -161,7 +167,7 @@ class _Run(Training):
                 steps = pretraining.pretrain(self.env, self.config, self.seeds, state=state, **data)
             self.follow(steps, done)
             assert self.best is not None  # evaluated before the first chunk
-            ahead.wait(self.measure)
+            ahead.wait(self.fit, self.measure, self.judges.hold)
             summary = self._hand_over(self.best)
         self.record.log.close()
         return summary
@@ -195,8 +201,24 @@ class _Run(Training):
             return jax.eval_shape(functools.partial(pretraining.exported, self.env, self.config), self.shapes().state)
 
         ahead.promise(system.program(self.policy), lambda: (params(), system.pools, system.which, keys, False))
+
+        def pools(size: int) -> World:
+            """Pools of that many worlds, where anything varies."""
+            shapes = jax.tree.leaves(worlds := self.shapes().worlds)
+            size = size if shapes[0].shape[1] > 1 else 1
+            return jax.tree.map(lambda x: jax.ShapeDtypeStruct((x.shape[0], size, *x.shape[2:]), x.dtype), worlds)
+
+        def to_fit() -> tuple[World, PyTree, Key]:
+            return pools(max(self.config.worlds, value_fit.WORLDS)), params(), seed_keys(self.seeds, Pretraining.VALUE)
+
+        def valued() -> PyTree:
+            return params()._replace(value=self.fit.eval_shape(*to_fit())) if self.fits else params()
+
+        if self.fits:
+            ahead.promise(self.fit, to_fit)
         if self.reports:
-            ahead.promise(self.measure, lambda: (self.shapes().worlds, params(), report))
+            ahead.promise(self.measure, lambda: (self.shapes().worlds, valued(), report))
+            ahead.promise(self.judges.hold, lambda: (pools(value_fit.WORLDS), valued(), report))
         ahead.begin(functools.partial(importlib.import_module, "tensorboardX"))  # seconds, where PyTorch is installed
 
     def _shapes(self) -> Shapes:
@@ -212,6 +234,18 @@ class _Run(Training):
         """The worlds [seeds, W] of a set."""
         keys = pretraining.world_keys(self.seeds, number)
         return _stacked([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
+
+    def _value_pools(self) -> World:
+        """The worlds [seeds, W] that V_sim is fitted in: those of training, or more where these are few."""
+        if self.config.worlds >= value_fit.WORLDS or pool_size(self.pools(0)) == 1:
+            return self.pools(0)
+        keys = seed_keys(self.seeds, Pretraining.VALUE)
+        return _stacked([training_worlds(self.env, self.gap, key, value_fit.WORLDS) for key in keys])
+
+    def _heldout_pools(self) -> World:
+        """As many that nobody has seen, with sensors as in training, the same for all seeds."""
+        pool = training_worlds(self.env, self.gap, jax.random.key(_VALUE_SEED), value_fit.WORLDS)
+        return jax.tree.map(lambda x: jnp.broadcast_to(x, (self.count, *x.shape)), pool)
 
     def _saved(self, state: FleetState) -> Saved:
         """What a first checkpoint holds."""
@@ -260,13 +294,22 @@ class _Run(Training):
 
     # ------------------------------------------------------------ what stays
 
+    def _value(self, best: evidence.Best) -> evidence.Best:
+        """The best policies with a V_sim of their own; a fit that was killed is repeated, with the same bits."""
+        pools, keys = self._value_pools(), seed_keys(self.seeds, Pretraining.VALUE)
+        value = jax.block_until_ready(self.fit(pools, best.params, keys))
+        return best._replace(params=best.params._replace(value=value))
+
     def _hand_over(self, best: evidence.Best) -> dict[str, Any]:
-        """Priors with their cards, report, figures, summary, closing words."""
+        """V_sim, priors with their cards, report, figures, summary, closing words."""
         report = None
+        if self.fits:
+            with self.clock("value"), doing("fitting V_sim", 40, once=True):
+                best = self._value(best)
         with self.clock("report"):
             if self.reports:
                 with doing("measuring V_sim and the models", 20, once=True):
-                    report = self._report(best.params)
+                    report, held, judged = self._report(best.params)
             with doing("playing fresh episodes for the cards", 5):
                 played = self._final_episodes(best.params)
         (score, total), best, results = *jax.device_get((_levels(best), best)), []
@@ -277,12 +320,12 @@ class _Run(Training):
             facts["best/env_steps"] = int(chosen.age) * self.config.n_envs
             facts |= {f"best/{self.env.score}": float(score[i]), "best/return": float(total[i])}
             if report is not None:
-                facts |= numbers(stacking.member(report, i))
+                facts |= judged[i] | numbers(stacking.member(report, i))
             results.append(facts)
         cards = {facts["seed"]: self._card(facts) for facts in results}
         self.record.save_policies("prior", best.params, cards.__getitem__)
         for i, seed in enumerate(self.seeds if report is not None else []):
-            self._save_report(seed, stacking.member(report, i), i)
+            self._save_report(seed, stacking.member(report, i), stacking.member(held, i), i)
         summary = {
             "task": self.env.name,
             "preset": self.args.preset,
@@ -320,24 +363,33 @@ class _Run(Training):
         played = [play(system, self.policy, params, key, n) for key in keys]
         return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *played)
 
-    def _report(self, params: PyTree) -> Report:
-        """[seeds] measurements, as NumPy arrays."""
-        report = self.measure(self.pools(0), params, seed_keys(self.seeds, Pretraining.REPORT))
-        return jax.tree.map(np.asarray, mesh.local(report))
+    def _report(self, params: PyTree) -> tuple[Report, Held, list[dict[str, Any]]]:
+        """[seeds] measurements, as NumPy arrays, and what they say of V_sim."""
+        keys = seed_keys(self.seeds, Pretraining.REPORT)
+        pools = self._heldout_pools()
+        measured = self.measure(self.pools(0), params, keys), self.judges.hold(pools, params, keys)
+        report, held = jax.tree.map(np.asarray, mesh.local(measured))
+        again = self.fits and self.gap is None and self.env.restore is not None
+        states = min(_STATES, self.config.eval_episodes // 2) if again else 0
+        pool, judged = stacking.member(pools, 0), []
+        for i in range(len(self.seeds)):
+            of_seed = stacking.member(held, i), pool, stacking.member(params, i), keys[i]
+            judged.append(value_numbers(self.judges, self.env, *of_seed, states))
+        return report, held, judged
 
-    def _save_report(self, seed: int, report: Report, i: int) -> None:
+    def _save_report(self, seed: int, report: Report, held: Held, i: int) -> None:
         """The arrays behind the figure, and the figure."""
         folder = self.record.folder
         curve = read_jsonl(folder / EVAL)
-        some = np.flatnonzero(report.counts)[:: max(1, report.counts.sum() // 2000)]  # points that a figure can show
+        some = np.flatnonzero(held.intact)[:2000]  # points that a figure can show
         (folder / "report").mkdir(exist_ok=True)
-        np.savez(folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
+        np.savez(folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict(), **held._asdict())
         if not some.size:
             return  # every trajectory exploded: there is nothing to draw
         figures.pretraining(
             folder / "figures" / f"seed-{seed}.png",
             ([line["step"] for line in curve], *([line[x][i] for line in curve] for x in ("success", "return"))),
-            (report.values[some], report.returns[some]),
+            (held.value[some], held.returns[some]),
             (report.model_error, report.still_error),
             title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
         )
@@ -351,8 +403,10 @@ class _Run(Training):
                 score = f"success {facts['success']:.3f} [{low:.3f}, {high:.3f}]"
             line = f"seed {facts['seed']}: {score} in {facts['episodes']} fresh episodes"
             if "value/explained_variance" in facts:
-                line += f"; V_sim explains {facts['value/explained_variance']:.2f} of the variance of returns, "
-                line += f"rank correlation {facts['value/rank_correlation']:.2f}, bias {facts['value/bias']:+.2f}"
+                line += f"; V_sim explains {facts['value/explained_variance']:.2f} of the variance of returns"
+                if "value/explainable_variance" in facts:
+                    line += f" (explainable: {facts['value/explainable_variance']:.2f})"
+                line += f", rank correlation {facts['value/rank_correlation']:.2f}, bias {facts['value/bias']:+.2f}"
             print(line)
         files = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (folder / name).exists())
         print(f"results: {folder}  ({files})")

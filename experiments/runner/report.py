@@ -1,33 +1,31 @@
-"""What a prior is worth to fine-tuning: V_sim against returns, the model against trajectories. Pure."""
+"""What a prior is worth to fine-tuning: V_sim against returns, the model against trajectories."""
 
 import functools
-import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from envs.base import Env, World
+from envs.base import Env, Theta, Varying, World
 from envs.mesh import split_vmap, whole
 from envs.rollout import Episode, play_episode
 from envs.types import Array, Key, Policy, PyTree
 from sgft_jax.models import value
+from sgft_jax.train.fleet import over_members
+from sgft_jax.train.value_fit import Held, hold, replays
 
 HORIZON = 10  # steps ahead that the model is judged at: twice the longest branches worth imagining
+_WORLDS = 16  # in which the policy plays on from the same observation
 
 
 class Report(NamedTuple):
-    """Measurements of one prior.
+    """Open-loop errors of one prior's model.
 
-    values, returns: [trajectories * episode_length] V_sim of the states that the exploring policy visits, and the
-    discounted returns that followed. counts: the same shape, bool, False in exploded episodes and after their end.
     model_error, still_error: [horizon] RMS error, in standard deviations of the observation, of the model's open-loop
     prediction 1, 2, ... steps ahead, and of predicting that nothing changes.
     """
 
-    values: Array
-    returns: Array
-    counts: Array
     model_error: Array
     still_error: Array
 
@@ -35,46 +33,92 @@ class Report(NamedTuple):
 def make_report(
     env: Env, policy: Policy, pool: World, prior: PyTree, key: Key, *, gamma: float, trajectories: int
 ) -> Report:
-    """Measures one prior on that many fresh trajectories of its exploring policy in the worlds it has learned in.
-
-    Trajectories run ceil(3 / (1 - gamma)) steps past the time limit, where 5 % of the discounted weight is left, and
-    V_sim of the last state stands for the rest.
-    """
-    length = env.episode_length + math.ceil(3 / (1 - gamma))
+    """Measures one prior on that many fresh trajectories of its exploring policy in the worlds it has learned in."""
     act = functools.partial(policy.act, prior, explore=True)
-    play = functools.partial(play_episode, env, pool, act, policy.init_carry(), gamma=gamma, length=length)
+    play = functools.partial(play_episode, env, pool, act, policy.init_carry(), gamma=gamma)
     played = split_vmap(play)(jax.random.split(key, trajectories))
-    values, returns = jax.vmap(lambda e: _values(env, policy, prior, e))(played)
     errors, windows = jax.vmap(lambda e: _model_errors(env, policy, prior, e))(played)
-    intact = ~played.exploded[:, None]
-    weight = windows * intact
+    weight = windows * ~played.exploded[:, None]
     model, still = (jnp.einsum("nw,nwh->h", weight, x) / jnp.maximum(weight.sum(), 1.0) for x in errors)
-    report = Report(
-        values=values.reshape(-1),
-        returns=returns.reshape(-1),
-        counts=(intact & played.valid[:, : env.episode_length]).reshape(-1),
-        model_error=model,
-        still_error=still,
-    )
-    return whole(report)
+    return whole(Report(model, still))
 
 
 def numbers(report: Report) -> dict[str, Any]:
     """A report (NumPy arrays) as JSON data: what stands in summary.json and on the card."""
-    summary: dict[str, Any] = value.report(report.values[report.counts], report.returns[report.counts])
-    if report.model_error.size:
-        summary["dynamics/error"] = report.model_error.tolist()
-        summary["dynamics/error_if_nothing_moved"] = report.still_error.tolist()
-    return summary
+    if not report.model_error.size:
+        return {}
+    return {
+        "dynamics/error": report.model_error.tolist(),
+        "dynamics/error_if_nothing_moved": report.still_error.tolist(),
+    }
 
 
-def _values(env: Env, policy: Policy, prior: PyTree, episode: Episode) -> tuple[Array, Array]:
-    """V_sim and Monte-Carlo returns [episode_length] of one episode."""
-    rows, value_of = episode.transitions, policy.value
-    assert value_of is not None  # checked before
-    predict = functools.partial(value_of, prior)
-    returns = value.discounted_returns(rows.reward, rows.discount, predict(rows.next_obs[-1]))
-    return jax.vmap(predict)(rows.obs[: env.episode_length]), returns[: env.episode_length]
+# --- V_sim ------------------------------------------------------------------------------------------------------------
+
+
+class Judges(NamedTuple):
+    """What measures V_sim of M members, jitted; see `hold` and `replays` in `sgft_jax.train.value_fit`.
+
+    hold(pools [M, W], params [M, ...], keys [M]). replays(worlds [M, n, w], params, obs [M, n, obs_dim], keys).
+    system: what V_sim can be told.
+    """
+
+    hold: Any
+    replays: Any
+    system: tuple[Varying, ...]
+
+
+def make_judges(
+    env: Env, system: tuple[Varying, ...], policy: Policy, gamma: float, *, episodes: int, members: int
+) -> Judges:
+    """They compile when they are first called, or before. episodes: fresh ones of each member."""
+    holds = functools.partial(hold, env, system, policy, gamma, episodes)
+    again = functools.partial(replays, env, policy, gamma)
+    return Judges(jax.jit(over_members(holds, members)), jax.jit(over_members(again, members)), system)
+
+
+def value_numbers(judges: Judges, env: Env, held: Held, pool: World, params: PyTree, key: Key, states: int) -> Any:
+    """The numbers of one member's V_sim as JSON data. held: of it, NumPy arrays. pool: [W], its worlds. params: its.
+
+    states: how many of these states are played again, in 16 worlds each; 0 leaves out what that tells.
+    """
+    intact = np.flatnonzero(held.intact)
+    if not intact.size:
+        return {}
+    judged = value.report(held.value[intact], held.returns[intact])
+    if judges.system:
+        told = value.report(held.told[intact], held.returns[intact])
+        judged |= {name.replace("value/", "value/system_"): x for name, x in told.items()}
+    if not states:
+        return judged
+    which = intact[:states]
+    key_worlds, key_effects, key_rest = jax.random.split(key, 3)
+    worlds = alike(env, pool, held.world[which], key_worlds)
+    size = len(which), _WORLDS + 1
+    effects = jax.random.split(key_effects, size)
+    keys = jnp.stack([effects.at[:, 0].set(effects[:, 1]), jax.random.split(key_rest, size)], axis=-1)
+    inputs = worlds, params, jnp.asarray(held.obs[which]), keys
+    returns, fine = judges.replays(*jax.tree.map(lambda x: x[None], inputs))
+    whole_rows = np.asarray(returns)[0][np.asarray(fine)[0].all(axis=1)]
+    return judged | (value.explainable(whole_rows) if len(whole_rows) > 1 else {})
+
+
+def alike(env: Env, pool: World, own: np.ndarray, key: Key) -> World:
+    """Worlds [n, 17]: twice the world `own` [n] of a pool, then 15 others of it at the same place.
+
+    What differs between episodes and is seen, such as where a hole is, stays that of the first.
+    """
+    place = np.array([p.place for p in env.parameters], bool)
+    others = np.asarray(jax.random.randint(key, (len(own), _WORLDS - 1), 0, pool.theta.params.shape[0]))
+    which = np.concatenate([own[:, None], others], axis=1)
+    theta = jax.tree.map(np.asarray, pool.theta)
+    params = np.where(place, theta.params[own][:, None], theta.params[which])
+    flat = Theta(params.reshape(which.size, -1), jax.tree.map(lambda x: x[which.reshape(-1)], theta.effects))
+    worlds = jax.tree.map(lambda x: x.reshape(*which.shape, *x.shape[1:]), env.make_worlds(flat))
+    return jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x], axis=1), worlds)
+
+
+# --- models -----------------------------------------------------------------------------------------------------------
 
 
 def _model_errors(env: Env, policy: Policy, prior: Any, episode: Episode) -> tuple[tuple[Array, Array], Array]:

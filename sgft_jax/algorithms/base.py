@@ -34,7 +34,9 @@ class NetworkEntry(Struct, forbid_unknown_fields=True):
     activation: Literal["relu", "tanh", "silu", "elu"] = "relu"
 
 
-class _Varying(Struct, forbid_unknown_fields=True):
+class VaryingEntry(Struct, forbid_unknown_fields=True):
+    """What a card says of `envs.base.Varying`."""
+
     name: str
     index: Count
     low: float
@@ -58,7 +60,7 @@ class Card(TypedDict):
     gamma: Annotated[float, Meta(ge=0, lt=1)]
     algorithm: NotRequired[str]
     previous_actions: NotRequired[Count]
-    system: NotRequired[list[_Varying]]
+    system: NotRequired[list[VaryingEntry]]
     ensemble_size: NotRequired[Width]
     gap: NotRequired[_Gap | None]
 
@@ -73,6 +75,7 @@ class Recipe(NamedTuple):
     hyper(steps []) -> the learner's numbers after so many steps of all environments.
     extract(agents [M]) -> params [M].
     replaced(carry, action) -> the carry if another action was taken than `act` chose.
+    valued: whether V_sim is fitted to the policy afterwards, see `train.value_fit`.
     """
 
     learner: Learner
@@ -80,6 +83,7 @@ class Recipe(NamedTuple):
     hyper: Callable[[Array], Any]
     extract: Callable[[Any], PyTree]
     replaced: Callable[[PyTree, Array], PyTree] = lambda carry, action: carry
+    valued: bool = False
 
 
 def scheduled(config: Config, numbers: Callable[[Array], Any]) -> Callable[[Array | int], Any]:

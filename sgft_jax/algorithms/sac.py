@@ -7,7 +7,17 @@ from msgspec import Meta, Struct
 
 from envs.types import Array, Policy, PyTree
 from sgft_jax import data, learners
-from sgft_jax.algorithms.base import Algorithm, Card, Config, NetworkEntry, Networks, Recipe, Width, scheduled
+from sgft_jax.algorithms.base import (
+    Algorithm,
+    Card,
+    Config,
+    NetworkEntry,
+    Networks,
+    Recipe,
+    VaryingEntry,
+    Width,
+    scheduled,
+)
 from sgft_jax.models.config import network_of
 from sgft_jax.types import Task
 
@@ -22,6 +32,7 @@ class _SACCard(Card):
     network: NetworkEntry
     critic_network: NotRequired[NetworkEntry | None]
     plan: NotRequired[_Plan | None]
+    value_system: NotRequired[list[VaryingEntry]]
 
 
 def _policy(card: Mapping[str, Any], task: Task) -> Policy:
@@ -43,10 +54,20 @@ def _networks(card: Mapping[str, Any], params: Any) -> Networks:
         twin = networks.make_critic(*sizes, network_of(card, "critic_network"), members=_members(params.critic))
         yield "critic", twin, params.critic
     if params.value is not None:
-        yield "value", networks.make_value(sizes[0], network), params.value
+        yield "value", _value_network(card, params.value), params.value
     if params.dynamics is not None:
         ensemble = networks.make_dynamics(*sizes, network, members=_members(params.dynamics))
         yield "dynamics", ensemble, params.dynamics
+
+
+def _value_network(card: Mapping[str, Any], params: PyTree) -> Any:
+    """An ensemble that can be told what the card lists; of older cards one network of observations alone."""
+    from sgft_jax.models import networks, value
+
+    obs_dim, network, system = card["obs_dim"], network_of(card), card.get("value_system")
+    if system is None:
+        return networks.make_value(obs_dim, network)
+    return value.make_v_sim(obs_dim, network, system=len(system), members=_members(params))
 
 
 def _members(ensemble: PyTree) -> int:
@@ -61,13 +82,13 @@ def _recipe(task: Task, config: Config) -> Recipe:
     sac = learners.sac
 
     def numbers(rate: Array) -> Any:
-        rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_dynamics", "lr_alpha"), rate)
+        rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_dynamics", "lr_alpha"), rate)
         return sac.SACHyper(**rates, tau=config.tau, alpha=config.alpha, entropy_per_dim=config.entropy_per_dim)
 
     shared = {name: getattr(config, name) for name in ("network", "ensemble_size", "policy_delay")}
     hyper = scheduled(config, numbers)
     learner = sac.make_sac(sac.SACConfig(task.obs_dim, task.act_dim, **shared), hyper(0))
-    return Recipe(learner, data.memory.transitions(task), hyper, sac.extract_params)
+    return Recipe(learner, data.memory.transitions(task), hyper, sac.extract_params, valued=True)
 
 
 ALGORITHM = Algorithm("sac", _SACCard, lambda: learners.sac.SACParams, _policy, _networks, _recipe, preset="robust")

@@ -179,6 +179,7 @@ def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
         "algorithm": algorithm.name,
         "previous_actions": card.get("previous_actions", 0),
         "system": card.get("system", []),
+        "value_system": card.get("value_system"),
         "gap": card.get("gap"),  # methods that ask for simulated data get that of one simulator
     }
 

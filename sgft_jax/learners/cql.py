@@ -30,7 +30,6 @@ class CQLConfig(SACConfig):
     """
 
     network: NetworkConfig = field(default_factory=two_layers)
-    train_value: bool = False
     train_dynamics: bool = False
     entropy_in_target: bool = False
     conservatism: checks.NotNegative = 2.0

@@ -57,7 +57,7 @@ def paid(batch: Batch, log_w: Array) -> Batch:
 
 def _sac_of(config: DARCConfig) -> SACConfig:
     sizes = config.obs_dim, config.act_dim, config.network
-    return SACConfig(*sizes, tune_alpha=config.tune_alpha, train_value=False, train_dynamics=False)
+    return SACConfig(*sizes, tune_alpha=config.tune_alpha, train_dynamics=False)
 
 
 def init(config: DARCConfig, key: Key, hyper: SACHyper | None = None, *, lr_ratio: float = 3e-4) -> DARCState:

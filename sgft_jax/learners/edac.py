@@ -33,7 +33,6 @@ class EDACConfig(SACConfig):
     """
 
     network: NetworkConfig = field(default_factory=lambda: NetworkConfig((256, 256, 256)))
-    train_value: bool = False
     train_dynamics: bool = False
     critics: Annotated[int, checks.least(2)] = 10
     diversity: checks.NotNegative = 1.0

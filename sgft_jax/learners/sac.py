@@ -1,4 +1,4 @@
-"""Soft actor-critic, with a value network and a dynamics ensemble that may be trained alongside.
+"""Soft actor-critic, with a dynamics ensemble that may be trained alongside.
 
 Structure (shapes, which networks train) is static in `SACConfig`; every number is a leaf of the state in `SACHyper`,
 so that learning rates and temperatures vmap like seeds do. Source: Haarnoja et al. 2018; SGFT Appendix C.
@@ -18,10 +18,11 @@ from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
 from sgft_jax.learners import steps
 from sgft_jax.learners.steps import Critic, Networks, Sampler
-from sgft_jax.math import losses, optim
+from sgft_jax.math import optim
 from sgft_jax.models import dynamics, networks, normalizer
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.models.value import make_v_sim
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 __all__ = ["SACConfig", "SACHyper", "SACParams", "SACState", "act", "extract_params"]
@@ -36,14 +37,14 @@ class SACConfig(checks.Checked):
     network: body of all networks; critic_network: body of the critic alone, default the same.
     context_dim: length of `Batch.context`, which actor and critic read beside the observation.
     tune_alpha: follow the target entropy; False keeps the temperature at `SACHyper.alpha`.
-    train_value, train_dynamics, ensemble_size: the extra networks of pretraining.
+    train_dynamics, ensemble_size: the extra networks of pretraining.
     train_critic: False keeps the critic as it is (a frozen-critic actor-critic).
     critics: members of the critic ensemble. target_critics: a target is the minimum over so many random ones of them,
         None = all (REDQ, RLPD). actor_mean: the actor follows the members' mean, not their minimum (RLPD).
     entropy_in_target: False bootstraps from Q alone.
     critic_baseline: Q(s, a) = net(s, a) - V(s) with V frozen: what a kept critic means under shaped rewards.
     actor_batch: leading rows of the batch that the actor learns from, None = all. weighted_actor: these rows count in
-        the losses of actor, temperature and value as they weigh; False = alike, and weights are of TD errors alone.
+        the losses of actor and temperature as they weigh; False = alike, and weights are of TD errors alone.
     policy_delay: critic updates per update of actor and temperature. max_grad_norm: per network, None = no clipping.
     """
 
@@ -53,7 +54,6 @@ class SACConfig(checks.Checked):
     critic_network: NetworkConfig | None = None
     context_dim: int = 0
     tune_alpha: bool = True
-    train_value: bool = True
     train_dynamics: bool = True
     ensemble_size: int = 5
     train_critic: bool = True
@@ -69,8 +69,6 @@ class SACConfig(checks.Checked):
     max_grad_norm: float | None = None
 
     def __post_init__(self) -> None:
-        if self.critic_baseline and self.train_value:
-            raise UserError("SAC option critic_baseline needs a frozen value network: set train_value to False")
         super().__post_init__()
         if (self.target_critics or 1) > self.critics:
             raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
@@ -83,7 +81,7 @@ class SACConfig(checks.Checked):
             *("actor_batch", "weighted_actor", "policy_delay", "max_grad_norm"),
         )
         choices = {name: getattr(options, name) for name in names} | others
-        return cls(train_value=False, train_dynamics=False, **choices)
+        return cls(train_dynamics=False, **choices)
 
 
 # What is added to the critic's loss: (critic, its params, policy, batch as the networks read it, key) -> []
@@ -101,7 +99,6 @@ class SACHyper(NamedTuple):
 
     lr_actor: float | Array = 3e-4
     lr_critic: float | Array = 3e-4
-    lr_value: float | Array = 3e-4
     lr_dynamics: float | Array = 3e-4
     lr_alpha: float | Array = 3e-4
     tau: float | Array = 0.005
@@ -122,7 +119,8 @@ class SACHyper(NamedTuple):
 class SACParams(NamedTuple):
     """What SAC leaves for fine-tuning: parameters alone.
 
-    actor, critic, value: networks; the critic has a leading axis of its two members.
+    actor, critic: networks; the critic has a leading axis of its two members.
+    value: of `models.value.make_v_sim`, or None before its stage, `train.value_fit`.
     dynamics: the delta-dynamics ensemble, leading axis = member.
     normalizer: statistics of the random-action data; every network above reads normalised observations.
     distortion: what the real system makes of commands, None = nothing.
@@ -139,8 +137,9 @@ class SACParams(NamedTuple):
 
 
 class SACState(struct.PyTreeNode):
-    """An agent in training; `value` and `dynamics` are an `optim.Fit`, or None where the configuration has no use.
+    """An agent in training; `dynamics` is an `optim.Fit`, or None where the configuration has no use.
 
+    value: parameters of V_sim, which never learns, for a critic that is relative to it; else None.
     anchor: parameters of the actor that an anchored one is held to, or None.
     """
 
@@ -162,7 +161,7 @@ def _networks(config: SACConfig) -> Networks:
         config=config,
         actor=networks.make_actor(inputs, act_dim, body),
         critic=networks.make_critic(inputs, act_dim, config.critic_network or body, members=config.critics),
-        value=networks.make_value(config.obs_dim, body),
+        value=make_v_sim(config.obs_dim, body),
         dynamics=networks.make_dynamics(config.obs_dim, act_dim, body, members=config.ensemble_size),
         optimiser=optim.adam(config.max_grad_norm),
     )
@@ -171,7 +170,7 @@ def _networks(config: SACConfig) -> Networks:
 def init(config: SACConfig, key: Key, hyper: SACHyper | None = None) -> SACState:
     """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
     nets, keys = _networks(config), jax.random.split(key, 4)
-    value = nets.value.init(keys[2]) if config.train_value or config.critic_baseline else None
+    value = nets.value.init(keys[2]) if config.critic_baseline else None
     model = nets.dynamics.init(keys[3]) if config.train_dynamics else None
     return _assemble(nets, hyper or SACHyper(), nets.actor.init(keys[0]), nets.critic.init(keys[1]), value, model)
 
@@ -194,7 +193,7 @@ def act(
 def update(
     config: SACConfig, state: SACState, batch: Batch, key: Key, *, critic_term: CriticTerm | None = None
 ) -> tuple[SACState, Metrics]:
-    """One step of critic, target, actor, temperature, then of value (on the actor's own draws) and dynamics.
+    """One step of critic, target, actor, temperature, then of dynamics.
 
     batch: [B, ...] raw. critic_term: what other algorithms add to the critic's loss. metrics: [] each.
     """
@@ -212,13 +211,10 @@ def update(
         state, metrics = _update_critic(nets, state, batch, (key_target, key_members), term)
     rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
     rows = rows if config.weighted_actor else rows._replace(weight=None)
-    state, q, log_prob, of_actor = _update_actor(nets, state, rows, key_actor)
+    state, log_prob, of_actor = _update_actor(nets, state, rows, key_actor)
     metrics |= of_actor
     if config.tune_alpha:
         state = _update_temperature(nets, state, rows, log_prob)
-    if config.train_value:
-        state, of_value = _update_value(nets, state, rows, q)
-        metrics |= of_value
     if config.train_dynamics:
         step = partial(dynamics.update, nets.dynamics, nets.optimiser, rate=state.hyper.lr_dynamics)
         fit, of_models = step(state.dynamics, state.normalizer, raw, key_dynamics)
@@ -249,7 +245,7 @@ def _assemble(
         critic=start(critic),
         target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
         log_alpha=start(jnp.maximum(jnp.log(hyper.alpha), steps.LOG_ALPHA_MIN)),
-        value=value and start(value),
+        value=value,
         dynamics=model and start(model),
         normalizer=normalizer.identity(nets.config.obs_dim),
         hyper=hyper,
@@ -267,7 +263,7 @@ def _relative(nets: Networks, state: SACState) -> Networks:
 
     def relative(params: PyTree, obs: Array, action: Array) -> Array:
         with networks.precision("float32"):  # as in value.predict: the difference of two large numbers
-            value = nets.value.apply(state.value.params, obs[: nets.config.obs_dim])
+            value = nets.value.apply(state.value, obs[: nets.config.obs_dim])
             return nets.critic.apply(params, obs, action) - value
 
     return nets._replace(critic=nets.critic._replace(apply=relative))
@@ -288,8 +284,8 @@ def _update_critic(
     return state.replace(critic=fit, target_critic=average), metrics
 
 
-def _update_actor(nets: Networks, state: SACState, rows: Batch, key: Key) -> tuple[SACState, Array, Array, Metrics]:
-    """Also returns the q [B, members] and log-probabilities [B] of the actions drawn, for value and temperature."""
+def _update_actor(nets: Networks, state: SACState, rows: Batch, key: Key) -> tuple[SACState, Array, Metrics]:
+    """Also returns the log-probabilities [B] of the actions drawn, for the temperature."""
     config, hyper, since = nets.config, state.hyper, state.step - state.hyper.actor_start
 
     def divergence(params: PyTree, obs: Array) -> Array:
@@ -298,9 +294,9 @@ def _update_actor(nets: Networks, state: SACState, rows: Batch, key: Key) -> tup
 
     rate = hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp)
     mean, penalty = config.actor_mean, divergence if config.anchored else None
-    fit, q, log_prob, metrics = steps.step_actor(nets, state, rows, key, rate=rate, mean=mean, penalty=penalty)
+    fit, _, log_prob, metrics = steps.step_actor(nets, state, rows, key, rate=rate, mean=mean, penalty=penalty)
     fit = optax.tree.where((since >= 0) & _policy_turn(config, state), fit, state.actor)
-    return state.replace(actor=fit), q, log_prob, metrics
+    return state.replace(actor=fit), log_prob, metrics
 
 
 def _update_temperature(nets: Networks, state: SACState, rows: Batch, log_prob: Array) -> SACState:
@@ -314,26 +310,15 @@ def _policy_turn(config: SACConfig, state: SACState) -> Array:
     return state.step % config.policy_delay == 0
 
 
-def _update_value(nets: Networks, state: SACState, rows: Batch, q: Array) -> tuple[SACState, Metrics]:
-    obs = rows.obs[:, : nets.config.obs_dim]
-
-    def loss(params: PyTree) -> tuple[Array, tuple[()]]:
-        values = jax.vmap(nets.value.apply, (None, 0))(params, obs)
-        return losses.row_mean(jax.vmap(losses.value_loss)(values, q), rows), ()
-
-    fit, value, _ = optim.minimise(nets.optimiser, loss, state.value, state.hyper.lr_value)
-    return state.replace(value=fit), {"value/loss": value}
-
-
 # --- between simulation and reality -----------------------------------------------------------------------------------
 
 
 def extract_params(state: SACState) -> SACParams:
-    """What a pretrained agent hands over. Its configuration must have trained value and dynamics."""
-    if state.value is None or state.dynamics is None:
-        raise UserError("a prior needs an agent trained with train_value and train_dynamics")
-    trained = (state.actor, state.critic, state.value, state.dynamics)
-    return SACParams(*(fit.params for fit in trained), normalizer=state.normalizer)
+    """What a pretrained agent hands over. Its configuration must have trained dynamics; V_sim is fitted later."""
+    if state.dynamics is None:
+        raise UserError("a prior needs an agent trained with train_dynamics")
+    actor, critic, models = (fit.params for fit in (state.actor, state.critic, state.dynamics))
+    return SACParams(actor, critic, None, models, state.normalizer)
 
 
 def state_from_prior(
@@ -347,7 +332,7 @@ def state_from_prior(
     """
     nets, of_prior = _networks(config), _networks(replace(config, context_dim=0))
     owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}: use the prior's own"
-    for name in ("actor", "value", *([] if reset_critic else ["critic"])):
+    for name in ("actor", *([] if reset_critic else ["critic"])):
         networks.check_params(name, getattr(of_prior, name), getattr(params, name), f"{owner} task and network")
     params = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
 
@@ -355,7 +340,7 @@ def state_from_prior(
         return networks.pad_first_layer(network, config.obs_dim, config.context_dim)
 
     critic = nets.critic.init(key) if reset_critic else pad(params.critic)
-    value = params.value if config.train_value or config.critic_baseline else None
+    value = params.value if config.critic_baseline else None
     model = params.dynamics if config.train_dynamics else None
     state = _assemble(nets, hyper, pad(params.actor), critic, value, model)
     anchor = jax.tree.map(jnp.copy, state.actor.params) if config.anchored else None

@@ -92,17 +92,6 @@ def temperature_loss(log_alpha: Array, log_prob: Array, *, target_entropy: Array
     return jnp.exp(log_alpha) * jax.lax.stop_gradient(-log_prob - target_entropy)
 
 
-def value_loss(value: Array, q: Array) -> Array:
-    """(V(s) - min_i Q_i(s, a))^2 with a ~ pi and Q constant, without entropy term. value: []; q: [members].
-
-    Source: SGFT Appendix C. The minimiser is the mean of Q over the policy's actions. Where Q is SAC's, that is the
-    value of the policy plus the entropy bonus alpha H of every later step, so V is above the returns of the task: with
-    reward 1, gamma 0.9, alpha 0.1 and entropy 2 it is 11.8, where the value is 10.
-    """
-    chex.assert_rank([value, q], [0, 1])
-    return (value - jax.lax.stop_gradient(jnp.min(q))) ** 2
-
-
 def dynamics_loss(prediction: Array, delta: Array) -> Array:
     """Mean over entries of the squared error in the change of the normalised observation. Both [obs_dim].
 

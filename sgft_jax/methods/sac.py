@@ -54,7 +54,7 @@ def build_fixed(config: SimulatorConfig, task: Task) -> HybridAgent:
     from sgft_jax.data import sources
     from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
 
-    structure = SACConfig(task.obs_dim, task.act_dim, network=config.network, train_value=False, train_dynamics=False)
+    structure = SACConfig(task.obs_dim, task.act_dim, network=config.network, train_dynamics=False)
     learner = make_sac(structure, SACHyper.chosen(config))
     return agent_of(learner, config, task, sources.two_buffers(0, config.rows), simulates=True)
 

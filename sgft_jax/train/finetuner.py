@@ -21,7 +21,7 @@ from sgft_jax.math import optim
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig, network_of
 from sgft_jax.models.distortion import Identified, Interface, command_interface
-from sgft_jax.models.networks import fix_first_layer, make_dynamics, make_value
+from sgft_jax.models.networks import fix_first_layer, make_dynamics
 from sgft_jax.policies import sac_policy
 from sgft_jax.train import options as rules
 from sgft_jax.train.guard import guarded
@@ -384,7 +384,7 @@ def dynamics_models(options: Any, network: NetworkConfig, task: Task) -> Models:
 def _imagine(
     learner: Learner, network: NetworkConfig, gamma: float, task: Task
 ) -> Callable[[FinetuneState, Key], Imagination]:
-    value_net = make_value(task.obs_dim, network)
+    value_net = value.make_v_sim(task.obs_dim, network)
     model = make_dynamics(task.obs_dim, task.act_dim, network)
 
     def imagine(state: FinetuneState, key: Key) -> Imagination:

@@ -1,24 +1,25 @@
 """Massive training in simulation. Members are seeds."""
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from envs.base import Domain, Env, EnvState, World
-from envs.domains import uniform
+from envs.base import Domain, Env, EnvState, Varying, World
+from envs.domains import sample_worlds, uniform
 from envs.mesh import split, whole
+from envs.observations import all_varying
 from envs.rollout import Fleet, launch
 from envs.types import Array, Key, PyTree, Transition
-from sgft_jax.algorithms import recipe_of
+from sgft_jax.algorithms import make_policy, recipe_of
 from sgft_jax.files.disk import jsonable
 from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.models import normalizer
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.stacking import member, stack
-from sgft_jax.train import fleet
+from sgft_jax.train import fleet, value_fit
 from sgft_jax.train.fleet import Collected, FleetState, Plan, RoundKeys, StartKeys, Trainer, over_members
 from sgft_jax.types import Batch, Metrics, Prior
 
@@ -107,9 +108,10 @@ def exported(env: Env, config: PretrainConfig, state: FleetState) -> PyTree:
     return recipe_of(env, config).extract(state.learner)
 
 
-def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:
-    """What a prior says of itself, as JSON data: all that it takes to use it."""
-    return {
+def prior_card(env: Env, config: PretrainConfig, system: tuple[Varying, ...] = ()) -> dict[str, Any]:
+    """What a prior says of itself, as JSON data: all that it takes to use it. system: what V_sim can be told."""
+    value = {"value_system": [v._asdict() for v in system]} if recipe_of(env, config).valued else {}
+    return value | {
         "task": env.name,
         "algorithm": config.algorithm,
         "obs_dim": env.obs_dim,
@@ -130,16 +132,43 @@ def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:
 
 
 def priors_of(env: Env, config: PretrainConfig, state: FleetState) -> list[Prior]:
-    """A prior for each member, with copies of the parameters as they are now."""
-    params, card = exported(env, config, state), prior_card(env, config)
-    return [Prior(jax.tree.map(jnp.copy, member(params, i)), card) for i in range(state.rounds.shape[0])]
+    """A prior for each member, with copies of the parameters as they are now, to which V_sim is fitted."""
+    params, members = exported(env, config, state), state.rounds.shape[0]
+    priors = [Prior(jax.tree.map(jnp.copy, member(params, i)), prior_card(env, config)) for i in range(members)]
+    return refitted(env, config, priors) if recipe_of(env, config).valued else priors
+
+
+def refitted(env: Env, config: PretrainConfig, priors: Sequence[Prior], *, seed: int = 0) -> list[Prior]:
+    """The same priors of SAC, policies of one task, with a new V_sim. env: with the training domain's effects.
+
+    config: what the fit takes, see `train.value_fit`; gamma and networks are those of the priors.
+    """
+    system, card = all_varying(env), priors[0].card
+    key_worlds, key_fit = jax.random.split(jax.random.key(seed))
+    pool = sample_worlds(env, key_worlds, max(config.worlds, value_fit.WORLDS))
+    fit = make_value_program(env, config, system, card, len(priors))
+    params = stack([prior.params for prior in priors])
+    pools = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(priors), *x.shape)), pool)
+    values = fit(pools, params, jax.random.split(key_fit, len(priors)))
+    told = {"value_system": [v._asdict() for v in system]}
+    return [
+        Prior(prior.params._replace(value=member(values, i)), {**prior.card, **told}) for i, prior in enumerate(priors)
+    ]
+
+
+def make_value_program(
+    env: Env, config: PretrainConfig, system: tuple[Varying, ...], card: Mapping[str, Any], members: int
+) -> Any:
+    """(pools [M, W], params [M, ...], keys [M]) -> V_sim's parameters [M, ...] of policies with that card, jitted."""
+    fit = functools.partial(value_fit.fit_value, env, system, make_policy(card, env), config)
+    return jax.jit(over_members(fit, members))
 
 
 def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
     """Bytes that one seed keeps on its devices, by the setting that decides them: experience, and what updates hold."""
     kept = recipe_of(env, config).memory
     drawn = config.updates_per_step * config.batch_size
-    networks = config.ensemble_size + 4  # two critics, actor and V_sim
+    networks = config.ensemble_size + 3  # two critics and the actor
     activations = 2 * networks * config.batch_size * sum(config.network.hidden) * 4  # forwards and backwards, float32
 
     def batches() -> Batch:
@@ -149,6 +178,7 @@ def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
         "random_transitions": fleet.bytes_of(lambda: kept.empty(config.random_transitions)),
         "replay_capacity": fleet.bytes_of(lambda: kept.empty(config.replay_capacity)),
         "batch_size": activations + 2 * fleet.bytes_of(batches),  # drawn, then put together
+        "value_episodes": value_fit.bytes_of(env, config) if recipe_of(env, config).valued else 0,
     }
 
 

@@ -40,7 +40,7 @@ def noise_of(key):
 def test_it_is_the_update_of_the_library(key):
     learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=NETWORK, ensemble_size=MEMBERS), HYPER)
     state = learner.init(key)
-    parts = {name: bare_sac.trained(layers(getattr(state, name).params)) for name in ("actor", "critic", "value")}
+    parts = {name: bare_sac.trained(layers(getattr(state, name).params)) for name in ("actor", "critic")}
     bare = bare_sac.Bare(
         **parts,
         target=layers(state.target_critic),

@@ -131,19 +131,17 @@ def compiled_once(learner):
 
 
 # alpha 1e-4: entropy changes the answers by less than their tolerance
-SAC_HYPER = sac.SACHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, lr_dynamics=1e-2, tau=0.1, alpha=1e-4)
+SAC_HYPER = sac.SACHyper(lr_actor=3e-3, lr_critic=1e-2, lr_dynamics=1e-2, tau=0.1, alpha=1e-4)
 
 
 def _sac(**options: Any):
     config = sac.SACConfig(2, 1, network=NET, tune_alpha=False, **options)
     learner = sac.make_sac(config, SAC_HYPER)
     critic = networks.make_critic(2, 1, config.critic_network or NET, members=config.critics)
-    value_net = networks.make_value(2, NET)
 
     @jax.jit
     def values(state, obs):
-        q = critic.apply(state.critic.params, obs, jnp.zeros(1))
-        return q if state.value is None else jnp.append(q, value_net.apply(state.value.params, obs))
+        return critic.apply(state.critic.params, obs, jnp.zeros(1))
 
     case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=400)
     return case._replace(mode=_mode(case))
@@ -295,7 +293,6 @@ MAKERS = {
         critics=10,
         target_critics=2,
         actor_mean=True,
-        train_value=False,
         train_dynamics=False,
         critic_network=dataclasses.replace(NET, layer_norm=True),
     ),

@@ -65,7 +65,7 @@ def test_diversity_keeps_gradients_apart(key):
 
 @pytest.mark.heavy
 def test_without_diversity_it_is_sac_with_many_critics(key):
-    structure = sac.SACConfig(2, 3, network=NET, critics=4, train_value=False, train_dynamics=False)
+    structure = sac.SACConfig(2, 3, network=NET, critics=4, train_dynamics=False)
     learners = edac.make_edac(edac.EDACConfig(2, 3, network=NET, critics=4, diversity=0.0)), sac.make_sac(structure)
     batch = batch_of(key)
     states = [jax.jit(lambda k, x=x: x.update(x.init(k), batch, k)[0])(key) for x in learners]

@@ -18,9 +18,9 @@ from sgft_jax.types import Batch
 INIT = jax.jit(sac.init, static_argnums=0)
 UPDATE = jax.jit(sac.update, static_argnums=0, static_argnames="critic_term")
 NET = networks.NetworkConfig(hidden=(8,))
-PLAIN = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
+PLAIN = sac.SACConfig(1, 1, network=NET, train_dynamics=False)
 # alpha 1e-4: entropy changes the answers below by less than their tolerance
-HYPER = sac.SACHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, tau=0.1, alpha=1e-4)
+HYPER = sac.SACHyper(lr_actor=3e-3, lr_critic=1e-2, tau=0.1, alpha=1e-4)
 ROWS = 128
 
 
@@ -78,10 +78,10 @@ def equal(a, b):
 def test_every_network_of_pretraining_moves_and_statistics_do_not(key):
     state = FULL_LEARNER.init(key)
     new, metrics = FULL_LEARNER.update(state, probe(key), key)
-    for name in ("actor", "critic", "value", "dynamics", "log_alpha"):
+    for name in ("actor", "critic", "dynamics", "log_alpha"):
         assert not equal(getattr(state, name).params, getattr(new, name).params), name
     assert equal(state.normalizer, new.normalizer) and equal(state.hyper, new.hyper) and new.step == 1
-    assert {"critic/loss", "actor/loss", "value/loss", "dynamics/mse", "actor/alpha"} <= set(metrics)
+    assert {"critic/loss", "actor/loss", "dynamics/mse", "actor/alpha"} <= set(metrics)
 
 
 @pytest.mark.heavy
@@ -95,7 +95,7 @@ def test_target_critic_follows_at_rate_tau(key):
 
 @pytest.mark.heavy
 def test_fixed_temperature_and_delayed_actor_keep_their_bits(key):
-    config = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_value=False, train_dynamics=False)
+    config = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_dynamics=False)
     state = start = INIT(config, key, HYPER._replace(alpha=0.01, actor_start=2.0))
     assert state.value is None and state.dynamics is None
     for step in range(3):
@@ -119,7 +119,7 @@ def test_actor_ramp_scales_the_first_steps(key):
 @pytest.mark.heavy
 def test_an_anchored_actor_stays_with_the_policy_it_began_with(key):
     """The dearer it is to leave, the less far it goes; what it is held to never moves."""
-    config = dataclasses.replace(FULL, tune_alpha=False, train_value=False, train_dynamics=False, anchored=True)
+    config = dataclasses.replace(FULL, tune_alpha=False, train_dynamics=False, anchored=True)
     actor = jax.vmap(networks.make_actor(1, 1, FULL.network).apply, (None, 0))
 
     @jax.jit
@@ -250,7 +250,7 @@ def test_weights_of_the_actors_rows_may_be_left_out(key):
     kept = state.replace(hyper=state.hyper._replace(lr_critic=jnp.float32(0)))
     half = batch._replace(weight=jnp.arange(ROWS) % 2 * 2.0)
     a, b = (update(kept, x, key)[0] for x in (batch, half))
-    for part in ("actor", "log_alpha", "value"):
+    for part in ("actor", "log_alpha"):
         assert equal(getattr(a, part), getattr(b, part))
     assert not equal(a.critic.moments, b.critic.moments)
 
@@ -297,11 +297,12 @@ def test_keys_decide(key):
 def prior():
     state = INIT(sac.SACConfig(3, 2, network=NET, ensemble_size=2), jax.random.key(7))
     statistics = normalizer.Normalizer(jnp.array([1.0, 2, 3]), jnp.array([2.0, 1, 0.5]))
-    return sac.extract_params(state.replace(normalizer=statistics))
+    params = sac.extract_params(state.replace(normalizer=statistics))
+    return params._replace(value=networks.make_value(3, NET).init(jax.random.key(9)))
 
 
 def tuned(prior, *, reset, extra=0, **options):
-    config = sac.SACConfig(3, 2, context_dim=extra, network=NET, train_value=False, train_dynamics=False, **options)
+    config = sac.SACConfig(3, 2, context_dim=extra, network=NET, train_dynamics=False, **options)
     start = jax.jit(partial(sac.state_from_prior, config), static_argnames="reset_critic")
     return sac.make_sac(config), start(HYPER._replace(alpha=0.01), prior, jax.random.key(0), reset_critic=reset)
 
@@ -355,12 +356,10 @@ def test_a_prior_of_another_shape_is_refused(prior):
     config = sac.SACConfig(4, 2, network=NET)
     with pytest.raises(UserError, match=r"prior actor.*\(3, 8\), expected \(4, 8\)"):
         sac.state_from_prior(config, sac.SACHyper(), prior, jax.random.key(0), reset_critic=True)
-    with pytest.raises(UserError, match="train_value and train_dynamics"):
+    with pytest.raises(UserError, match="train_dynamics"):
         sac.extract_params(INIT(PLAIN, jax.random.key(0)))
 
 
 def test_impossible_options_are_refused():
-    with pytest.raises(UserError, match="critic_baseline"):
-        sac.SACConfig(1, 1, critic_baseline=True)
     with pytest.raises(UserError, match="policy-delay"):
         sac.SACConfig(1, 1, policy_delay=0)

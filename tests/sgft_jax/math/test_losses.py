@@ -46,12 +46,6 @@ def test_temperature_loss_by_hand():
     assert value == -1.0 and slope == -1.0
 
 
-def test_value_loss_by_hand():
-    # (1 - min(3, 4))^2 = 4, slope 2 (1 - 3) = -4, no gradient to the critics
-    value, (slope, to_q) = jax.value_and_grad(losses.value_loss, (0, 1))(f(1.0), jnp.array([3.0, 4.0]))
-    assert value == 4.0 and slope == -4.0 and jnp.all(to_q == 0)
-
-
 def test_dynamics_loss_by_hand():
     # ((1 - 0)^2 + (2 - 4)^2) / 2 = 2.5
     assert losses.dynamics_loss(jnp.array([1.0, 2.0]), jnp.array([0.0, 4.0])) == 2.5
