@@ -52,7 +52,7 @@ class PretrainConfig(checks.Checked):
     lr: checks.Positive = 3e-4
     """Adam learning rate of every network at the start."""
     lr_end: checks.Share = 1.0
-    """Share of the learning rate that is left at the end; it falls linearly. A falling rate settles V_sim."""
+    """Share of the learning rate that is left at the end; it falls linearly. A falling rate settles the critic."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Networks of SAC; of recurrent SAC what follows the GRUs."""
     gru: checks.Few = 128
@@ -69,8 +69,8 @@ class PretrainConfig(checks.Checked):
     random_fraction: checks.BelowOne = 0.5
     """Share of each batch that comes from the random actions (paper: 0.5)."""
     random_ladder: checks.Share = 0.0
-    """Environment i of n replaces a share i / (n - 1) * random_ladder of its actions by random ones. V_sim then also
-    knows states beside the policy's own path, where a real system leads; 0 replaces none."""
+    """Environment i of n replaces a share i / (n - 1) * random_ladder of its actions by random ones. The
+    networks then also know states beside the policy's own path, where a real system leads; 0 replaces none."""
     tau: Annotated[float, checks.positive, checks.share] = 0.005
     """Averaging rate of the target critic."""
     alpha: checks.Positive = 1.0

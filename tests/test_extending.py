@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import untrained
 
 import envs
 from envs import extend, gaps
@@ -43,10 +44,10 @@ def _own(monkeypatch):
 def prior(tmp_path_factory):
     """An untrained prior of the example's task, with its card."""
     home = tmp_path_factory.mktemp("runs")
-    agent = sac.make_sac(sac.SACConfig(3, 1, network=NETWORK, ensemble_size=2))
+    config = sac.SACConfig(3, 1, network=NETWORK, ensemble_size=2)
     card = {"task": "own_task", "obs_dim": 3, "act_dim": 1, "network": jsonable(NETWORK), "gamma": 0.9}
     folder = home / "pretrain/own_task/fast/seed-0/prior/seed-0"
-    params = sac.extract_params(jax.jit(agent.init)(jax.random.key(0)))
+    params = jax.jit(lambda key: untrained.sac_params(config, key))(jax.random.key(0))
     save_prior(folder, Prior(params, {**card, "algorithm": "sac", "ensemble_size": 2, "seed": 0}))
     return folder
 

@@ -402,11 +402,12 @@ class _Run(Training):
             if self.env.score == "success":
                 score = f"success {facts['success']:.3f} [{low:.3f}, {high:.3f}]"
             line = f"seed {facts['seed']}: {score} in {facts['episodes']} fresh episodes"
-            if "value/explained_variance" in facts:
-                line += f"; V_sim explains {facts['value/explained_variance']:.2f} of the variance of returns"
+            if "value/off_path_explained_variance" in facts:
+                line += f"; V_sim explains {facts['value/off_path_explained_variance']:.2f} of the variance of returns"
                 if "value/explainable_variance" in facts:
                     line += f" (explainable: {facts['value/explainable_variance']:.2f})"
-                line += f", rank correlation {facts['value/rank_correlation']:.2f}, bias {facts['value/bias']:+.2f}"
+                line += f", rank correlation {facts['value/off_path_rank_correlation']:.2f}"
+                line += f", bias {facts['value/off_path_bias']:+.2f}"
             print(line)
         files = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (folder / name).exists())
         print(f"results: {folder}  ({files})")

@@ -85,15 +85,15 @@ def value_numbers(judges: Judges, env: Env, held: Held, pool: World, params: PyT
     intact = np.flatnonzero(held.intact)
     if not intact.size:
         return {}
-    judged = value.report(held.value[intact], held.returns[intact])
-    if judges.system:
-        told = value.report(held.told[intact], held.returns[intact])
-        judged |= {name.replace("value/", "value/system_"): x for name, x in told.items()}
+    judged = {}
+    for prefix, values in (("off_path_", held.value), *([("system_", held.told)] if judges.system else [])):
+        quality = value.report(values[intact], held.returns[intact])
+        judged |= {name.replace("value/", f"value/{prefix}"): x for name, x in quality.items()}
     if not states:
         return judged
     which = intact[:states]
     key_worlds, key_effects, key_rest = jax.random.split(key, 3)
-    worlds = alike(env, pool, held.world[which], key_worlds)
+    worlds = alike(env, pool, held.world[which], held.obs[which[0]], key_worlds)
     size = len(which), _WORLDS + 1
     effects = jax.random.split(key_effects, size)
     keys = jnp.stack([effects.at[:, 0].set(effects[:, 1]), jax.random.split(key_rest, size)], axis=-1)
@@ -103,19 +103,31 @@ def value_numbers(judges: Judges, env: Env, held: Held, pool: World, params: PyT
     return judged | (value.explainable(whole_rows) if len(whole_rows) > 1 else {})
 
 
-def alike(env: Env, pool: World, own: np.ndarray, key: Key) -> World:
-    """Worlds [n, 17]: twice the world `own` [n] of a pool, then 15 others of it at the same place.
+def alike(env: Env, pool: World, own: np.ndarray, obs: np.ndarray, key: Key) -> World:
+    """Worlds [n, 17] that look alike: twice the world `own` [n] of a pool, then 15 others with its visible parameters.
 
-    What differs between episodes and is seen, such as where a hole is, stays that of the first.
+    obs: [obs_dim] some observation.
     """
-    place = np.array([p.place for p in env.parameters], bool)
     others = np.asarray(jax.random.randint(key, (len(own), _WORLDS - 1), 0, pool.theta.params.shape[0]))
     which = np.concatenate([own[:, None], others], axis=1)
     theta = jax.tree.map(np.asarray, pool.theta)
-    params = np.where(place, theta.params[own][:, None], theta.params[which])
+    visible = np.broadcast_to(_visible(env, theta, obs), (*which.shape, theta.params.shape[1]))
+    params = np.where(visible, np.broadcast_to(theta.params[own][:, None], visible.shape), theta.params[which])
     flat = Theta(params.reshape(which.size, -1), jax.tree.map(lambda x: x[which.reshape(-1)], theta.effects))
     worlds = jax.tree.map(lambda x: x.reshape(*which.shape, *x.shape[1:]), env.make_worlds(flat))
     return jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x], axis=1), worlds)
+
+
+def _visible(env: Env, theta: Theta, obs: np.ndarray) -> np.ndarray:
+    """[n_params] bool: whether sensors show a parameter, such as where a hole is: with another no state reads `obs`."""
+    restore, size = env.restore, theta.params.shape[1]
+    assert restore is not None  # checked before
+    params = np.tile(theta.params[0], (size + 1, 1))
+    params[range(size), range(size)] = theta.params[-1]
+    effects = jax.tree.map(lambda x: np.broadcast_to(x[0], (size + 1, *x.shape[1:])), theta.effects)
+    worlds = env.make_worlds(Theta(params, effects))
+    read = np.asarray(jax.vmap(lambda world: restore(world, jnp.asarray(obs), jax.random.key(0)).true_obs)(worlds))
+    return (np.abs(read[:-1] - read[-1:]) > 1e-4 * (1 + np.abs(read[-1:]))).any(axis=1)
 
 
 # --- models -----------------------------------------------------------------------------------------------------------

@@ -141,16 +141,26 @@ def priors_of(env: Env, config: PretrainConfig, state: FleetState) -> list[Prior
 def refitted(env: Env, config: PretrainConfig, priors: Sequence[Prior], *, seed: int = 0) -> list[Prior]:
     """The same priors of SAC, policies of one task, with a new V_sim. env: with the training domain's effects.
 
-    config: what the fit takes, see `train.value_fit`; gamma and networks are those of the priors.
+    config: how it is fitted, with the discount and the network of the priors.
     """
-    system, card = all_varying(env), priors[0].card
+    fit, inputs = value_fit_of(env, config, priors, seed=seed)
+    return with_values(env, priors, fit(*inputs))
+
+
+def value_fit_of(
+    env: Env, config: PretrainConfig, priors: Sequence[Prior], *, seed: int = 0
+) -> tuple[Any, tuple[World, PyTree, Key]]:
+    """The program of that fit, see `make_value_program`, and what it takes."""
     key_worlds, key_fit = jax.random.split(jax.random.key(seed))
-    pool = sample_worlds(env, key_worlds, max(config.worlds, value_fit.WORLDS))
-    fit = make_value_program(env, config, system, card, len(priors))
-    params = stack([prior.params for prior in priors])
+    pool, params = sample_worlds(env, key_worlds, max(config.worlds, value_fit.WORLDS)), [p.params for p in priors]
     pools = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(priors), *x.shape)), pool)
-    values = fit(pools, params, jax.random.split(key_fit, len(priors)))
-    told = {"value_system": [v._asdict() for v in system]}
+    program = make_value_program(env, config, all_varying(env), priors[0].card, len(priors))
+    return program, (pools, stack([p._replace(value=None) for p in params]), jax.random.split(key_fit, len(priors)))
+
+
+def with_values(env: Env, priors: Sequence[Prior], values: PyTree) -> list[Prior]:
+    """These priors with other parameters of V_sim [M, ...]."""
+    told = {"value_system": [v._asdict() for v in all_varying(env)]}
     return [
         Prior(prior.params._replace(value=member(values, i)), {**prior.card, **told}) for i, prior in enumerate(priors)
     ]

@@ -3,10 +3,11 @@
 import functools
 
 import jax
+import untrained
 
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io import priors
-from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
+from sgft_jax.learners.sac import SACConfig
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Prior
 
@@ -16,7 +17,7 @@ NETWORK = NetworkConfig(hidden=(8,))
 @functools.cache
 def initial(config):
     """key -> the parameters of an untrained prior, in one program."""
-    return jax.jit(lambda key: extract_params(make_sac(config).init(key)))
+    return jax.jit(lambda key: untrained.sac_params(config, key))
 
 
 def save_prior(folder, seed, **changes):

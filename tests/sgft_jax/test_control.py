@@ -29,8 +29,15 @@ MARGIN, RETURN_MARGIN = 0.03, 0.2  # how far mean success, and the mean return o
 SMALL = {"simulated_transitions": 4000}
 HARSH = {"utd": 24.0}  # for `sac`, whose own one update per transition loses little
 LOOP = {"env_steps": 45_000, "n_envs": 64, "worlds": 16, "random_transitions": 2000, "random_ladder": 0.5}
-LEARNING = {"replay_capacity": 20_000, "updates_per_step": 2, "batch_size": 128, "gamma": 0.95, "lr": 1e-3}
-NETWORKS = {"network": NetworkConfig(hidden=(32, 32)), "ensemble_size": 1}
+LEARNING = {
+    "replay_capacity": 20_000,
+    "updates_per_step": 2,
+    "batch_size": 128,
+    "gamma": 0.95,
+    "lr": 1e-3,
+    "value_episodes": 256,
+}
+NETWORKS = {"network": NetworkConfig(hidden=(32, 32)), "ensemble_size": 1, "value_updates": 2000}
 PRETRAIN = PretrainConfig(**LOOP, **LEARNING, **NETWORKS, alpha=0.1)
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import untrained
 
 from envs.types import Transition, UserError
 from sgft_jax import planning
@@ -189,7 +190,7 @@ def plan(monkeypatch):
         still = networks.Network(lambda key: None, lambda params, obs: jnp.array([[0.0], [-20.0]]))
         monkeypatch.setattr(networks, "make_dynamics", lambda *_: model)
         monkeypatch.setattr(
-            networks, "make_value", lambda *_: networks.Network(lambda key: None, lambda _, s: value(s[0]))
+            planning.value, "make_v_sim", lambda *_: networks.Network(lambda key: None, lambda _, s, __: value(s[0]))
         )
         monkeypatch.setattr(networks, "make_actor", lambda *_: still)
         config = planning.MPCConfig(1, 1, NET, horizon=horizon, noise=noise, gamma=gamma)
@@ -311,8 +312,8 @@ def tuner():
 
 @functools.cache
 def prior():
-    agent = sac.make_sac(sac.SACConfig(1, 1, network=NET, ensemble_size=3))
-    return sac.extract_params(jax.jit(agent.init)(jax.random.key(7)))
+    config = sac.SACConfig(1, 1, network=NET, ensemble_size=3)
+    return jax.jit(lambda key: untrained.sac_params(config, key))(jax.random.key(7))
 
 
 def rows(n=64):

@@ -31,8 +31,9 @@ from sgft_jax.types import Learner
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
 LOOP = {"n_envs": N, "chunk_steps": STEPS, "env_steps": 2 * N * STEPS, "worlds": 4, "random_transitions": LENGTH * N}
 LEARNING = {"replay_capacity": 4 * N * STEPS, "batch_size": 8, "updates_per_step": 1, "gamma": 0.9}
+VALUE = {"value_episodes": 8, "value_updates": 40}
 NETWORKS = {"ensemble_size": 1, "size": tuners.TINY, "horizon": 2, "plan_samples": 8, "gru": 4}
-CONFIG = PretrainConfig(**LOOP, **LEARNING, **NETWORKS, network=NetworkConfig(hidden=(8,)))
+CONFIG = PretrainConfig(**LOOP, **LEARNING, **VALUE, **NETWORKS, network=NetworkConfig(hidden=(8,)))
 
 
 @pytest.fixture(autouse=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import toy
 import tuners
+import untrained
 
 import envs
 from envs.base import Varying
@@ -40,8 +41,8 @@ N, K = 20, len(SYSTEM)
 def prior():
     """Untrained: what its models make of the system decides what real steps look like here."""
     config = PretrainConfig(network=tuners.NET, ensemble_size=2, sees_system=True)
-    init = sac.make_sac(sac.SACConfig(ENV.obs_dim, 2, network=config.network, ensemble_size=2)).init
-    params = tuners.shaken(sac.extract_params(jax.jit(init)(jax.random.key(7))))
+    structure = sac.SACConfig(ENV.obs_dim, 2, network=config.network, ensemble_size=2)
+    params = tuners.shaken(jax.jit(lambda key: untrained.sac_params(structure, key))(jax.random.key(7)))
     statistics = Normalizer(jnp.zeros(ENV.obs_dim), jnp.ones(ENV.obs_dim))
     return Prior(params._replace(normalizer=statistics), prior_card(ENV, config))
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import untrained
 
 from envs.types import Transition
 from sgft_jax import methods
@@ -16,7 +17,6 @@ from sgft_jax.data import replay
 from sgft_jax.files.disk import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.models.networks import make_value
 from sgft_jax.train.simulation import SimulatedRows
 from sgft_jax.types import Finetuner, Normalizer, Prior
 
@@ -79,9 +79,8 @@ def prior(algorithm="sac"):
         params = recurrent.extract_params(jax.jit(init)(jax.random.key(7)))
         card = {"algorithm": "recurrent", "network": jsonable(NET), "config": {"gru": 4}, "gamma": 0.9}
     else:
-        init = sac.make_sac(sac.SACConfig(2, 2, network=NET, ensemble_size=2)).init
-        value = make_value(2, NET).init(jax.random.split(jax.random.key(7), 4)[2])
-        params = sac.extract_params(jax.jit(init)(jax.random.key(7)))._replace(value=value)
+        init = functools.partial(untrained.sac_params, sac.SACConfig(2, 2, network=NET, ensemble_size=2))
+        params = jax.jit(init)(jax.random.key(7))
         told = [{"name": "wind", "index": 0, "low": -1.0, "high": 1.0}]  # `sysid` takes the last number for it
         card = {"algorithm": "sac", "network": jsonable(NET), "gamma": 0.9, "system": told}
     return Prior(shaken(params)._replace(normalizer=statistics), card)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import toy
 import tuners
+import untrained
 
 import envs
 from envs.base import Varying
@@ -46,7 +47,7 @@ def drawn(init):
 
 def of_sac(env, network=NETWORK, *, plan=None, **changes):
     config = sac.SACConfig(env.obs_dim, env.act_dim, network=network, ensemble_size=2)
-    params = drawn(lambda key: sac.extract_params(sac.make_sac(config).init(key)))
+    params = drawn(lambda key: untrained.sac_params(config, key))
     return params._replace(**changes), {"network": jsonable(network), **({"plan": plan} if plan else {})}
 
 

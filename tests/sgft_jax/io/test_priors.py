@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tuners
+import untrained
 from test_checkpoint import bits, damage_flip, damage_truncate
 
 from envs.types import UserError
@@ -40,8 +41,8 @@ def drawn(init):
 
 @functools.cache
 def of_sac(network):
-    learner = sac.make_sac(sac.SACConfig(4, 2, network=network, ensemble_size=2))
-    return drawn(lambda key: sac.extract_params(learner.init(key)))
+    config = sac.SACConfig(4, 2, network=network, ensemble_size=2)
+    return drawn(lambda key: untrained.sac_params(config, key))
 
 
 def make_prior(scale=1.0, network=NETWORK, **changes):

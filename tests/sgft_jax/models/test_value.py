@@ -26,7 +26,7 @@ def test_explained_variance_by_hand():
 
 
 def test_predict_normalises(key):
-    network = networks.make_value(2, networks.NetworkConfig((8,)))
+    network = value.make_v_sim(2, networks.NetworkConfig((8,)))
     params, statistics = network.init(key), Normalizer(jnp.array([1.0, 2]), jnp.array([2.0, 4]))
     got = value.predict(network, params, statistics, jnp.array([3.0, 10.0]))
     np.testing.assert_allclose(got, network.apply(params, jnp.array([1.0, 2.0])), rtol=1e-6)
@@ -34,5 +34,8 @@ def test_predict_normalises(key):
 
 def test_report():
     assert value.report([1.0, 2.0], [0.0, 1.0]) == pytest.approx(
-        {"value/bias": 1.0, "value/explained_variance": 1.0, "value/rank_correlation": 1.0}
+        {
+            name: 1.0
+            for name in ("value/bias", "value/bias_of_range", "value/explained_variance", "value/rank_correlation")
+        }
     )
