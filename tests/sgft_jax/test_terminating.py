@@ -39,7 +39,7 @@ N, STEPS = 8, 30  # environments and steps of pretraining
 LOOP = {"n_envs": N, "chunk_steps": STEPS, "env_steps": N * STEPS, "worlds": 4, "random_transitions": LENGTH * N}
 LEARNING = {"replay_capacity": N * STEPS, "batch_size": 8, "updates_per_step": 1, "gamma": 0.9}
 NETWORKS = {"network": NET, "ensemble_size": 2, "size": tuners.TINY, "horizon": 2, "plan_samples": 24, "gru": 4}
-CONFIG = PretrainConfig(**LOOP, **LEARNING, **NETWORKS)
+CONFIG = PretrainConfig(**LOOP, **LEARNING, **NETWORKS, value_episodes=16, value_updates=40)
 
 each_method = pytest.mark.parametrize("name", METHODS)
 each_algorithm = pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])

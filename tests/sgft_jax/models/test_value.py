@@ -33,9 +33,5 @@ def test_predict_normalises(key):
 
 
 def test_report():
-    assert value.report([1.0, 2.0], [0.0, 1.0]) == pytest.approx(
-        {
-            name: 1.0
-            for name in ("value/bias", "value/bias_of_range", "value/explained_variance", "value/rank_correlation")
-        }
-    )
+    names = ("bias", "bias_of_range", "explained_variance", "rank_correlation")
+    assert value.report([1.0, 2.0], [0.0, 1.0]) == pytest.approx({f"value/{name}": 1.0 for name in names})
