@@ -134,14 +134,15 @@ class _Run(Training):
         every = {"eval_every": self.config.eval_every * size, "checkpoint_every": self.config.checkpoint_every * size}
         super().__init__(f"pretrain {env.name}", self.config.chunks * size, len(record.seeds), **every)
         system = all_varying(env, gap.params, gap.effects) if gap else all_varying(env)
-        self.card = pretraining.prior_card(env, self.config, system)
+        self.fits = recipe_of(env, self.config).valued
+        self.card = pretraining.prior_card(env, self.config) | (pretraining.told(system) if self.fits else {})
         self.policy = make_policy(self.card, env)
         self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
         self.shapes = functools.cache(self._shapes)
         self.programs = pretraining.make_programs(env, self.config, len(self.seeds))
         measure = functools.partial(make_report, env, self.policy, gamma=self.config.gamma)
         self.measure = jax.jit(jax.vmap(functools.partial(measure, trajectories=self.config.eval_episodes)))
-        self.reports, self.fits = args.report and self.policy.value is not None, recipe_of(env, self.config).valued
+        self.reports = args.report and self.policy.value is not None
         self.fit = pretraining.make_value_program(env, self.config, system, self.card, len(self.seeds))
         known, n = system if self.fits else (), self.config.report_episodes
         self.judges = make_judges(env, known, self.policy, self.config.gamma, episodes=n, members=len(self.seeds))

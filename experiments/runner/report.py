@@ -93,7 +93,7 @@ def value_numbers(judges: Judges, env: Env, held: Held, pool: World, params: PyT
         return judged
     which = intact[:states]
     key_worlds, key_effects, key_rest = jax.random.split(key, 3)
-    worlds = alike(env, pool, held.world[which], held.obs[which[0]], key_worlds)
+    worlds = alike(env, pool, np.asarray(held.world)[which], held.obs[which[0]], key_worlds)
     size = len(which), _WORLDS + 1
     effects = jax.random.split(key_effects, size)
     keys = jnp.stack([effects.at[:, 0].set(effects[:, 1]), jax.random.split(key_rest, size)], axis=-1)
@@ -103,7 +103,7 @@ def value_numbers(judges: Judges, env: Env, held: Held, pool: World, params: PyT
     return judged | (value.explainable(whole_rows) if len(whole_rows) > 1 else {})
 
 
-def alike(env: Env, pool: World, own: np.ndarray, obs: np.ndarray, key: Key) -> World:
+def alike(env: Env, pool: World, own: np.ndarray, obs: Array, key: Key) -> World:
     """Worlds [n, 17] that look alike: twice the world `own` [n] of a pool, then 15 others with its visible parameters.
 
     obs: [obs_dim] some observation.
@@ -113,19 +113,21 @@ def alike(env: Env, pool: World, own: np.ndarray, obs: np.ndarray, key: Key) -> 
     theta = jax.tree.map(np.asarray, pool.theta)
     visible = np.broadcast_to(_visible(env, theta, obs), (*which.shape, theta.params.shape[1]))
     params = np.where(visible, np.broadcast_to(theta.params[own][:, None], visible.shape), theta.params[which])
-    flat = Theta(params.reshape(which.size, -1), jax.tree.map(lambda x: x[which.reshape(-1)], theta.effects))
+    flat = Theta(
+        jnp.asarray(params.reshape(which.size, -1)), jax.tree.map(lambda x: x[which.reshape(-1)], theta.effects)
+    )
     worlds = jax.tree.map(lambda x: x.reshape(*which.shape, *x.shape[1:]), env.make_worlds(flat))
     return jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x], axis=1), worlds)
 
 
-def _visible(env: Env, theta: Theta, obs: np.ndarray) -> np.ndarray:
+def _visible(env: Env, theta: Theta, obs: Array) -> np.ndarray:
     """[n_params] bool: whether sensors show a parameter, such as where a hole is: with another no state reads `obs`."""
     restore, size = env.restore, theta.params.shape[1]
     assert restore is not None  # checked before
     params = np.tile(theta.params[0], (size + 1, 1))
     params[range(size), range(size)] = theta.params[-1]
     effects = jax.tree.map(lambda x: np.broadcast_to(x[0], (size + 1, *x.shape[1:])), theta.effects)
-    worlds = env.make_worlds(Theta(params, effects))
+    worlds = env.make_worlds(Theta(jnp.asarray(params), effects))
     read = np.asarray(jax.vmap(lambda world: restore(world, jnp.asarray(obs), jax.random.key(0)).true_obs)(worlds))
     return (np.abs(read[:-1] - read[-1:]) > 1e-4 * (1 + np.abs(read[-1:]))).any(axis=1)
 

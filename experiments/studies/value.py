@@ -97,12 +97,14 @@ def _line(args: ValueArgs, name: str) -> dict[str, Any]:
         seconds = time.perf_counter() - begun
         (new,) = pretraining.with_values(env, [prior], values)
     system, policy = all_varying(env), make_policy(new.card, env)
+    value_of = policy.value
+    assert value_of is not None  # as priors of SAC have it
     judges = make_judges(env, system, policy, config.gamma, episodes=args.held, members=1)
     pool, params = sample_worlds(env, key_worlds, WORLDS), stack([new.params])
     with doing("measuring it", 60, once=True):
         held = jax.tree.map(lambda x: np.asarray(x)[0], judges.hold(stack([pool]), params, key_held[None]))
         judged = value_numbers(judges, env, held, pool, new.params, key_again, args.states)
-        old = jax.vmap(lambda obs: policy.value(prior.params, obs))(jnp.asarray(held.obs))
+        old = jax.vmap(lambda obs: value_of(prior.params, obs))(jnp.asarray(held.obs))
     missed = held.returns - np.asarray(old)
     if args.save:
         save_prior(

@@ -108,10 +108,9 @@ def exported(env: Env, config: PretrainConfig, state: FleetState) -> PyTree:
     return recipe_of(env, config).extract(state.learner)
 
 
-def prior_card(env: Env, config: PretrainConfig, system: tuple[Varying, ...] = ()) -> dict[str, Any]:
-    """What a prior says of itself, as JSON data: all that it takes to use it. system: what V_sim can be told."""
-    value = {"value_system": [v._asdict() for v in system]} if recipe_of(env, config).valued else {}
-    return value | {
+def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:
+    """What a prior says of itself, as JSON data: all that it takes to use it."""
+    return {
         "task": env.name,
         "algorithm": config.algorithm,
         "obs_dim": env.obs_dim,
@@ -158,11 +157,17 @@ def value_fit_of(
     return program, (pools, stack([p._replace(value=None) for p in params]), jax.random.split(key_fit, len(priors)))
 
 
+def told(system: tuple[Varying, ...]) -> dict[str, Any]:
+    """What a card says of a V_sim that can be told this."""
+    return {"value_system": [v._asdict() for v in system]}
+
+
 def with_values(env: Env, priors: Sequence[Prior], values: PyTree) -> list[Prior]:
     """These priors with other parameters of V_sim [M, ...]."""
-    told = {"value_system": [v._asdict() for v in all_varying(env)]}
+    system = told(all_varying(env))
     return [
-        Prior(prior.params._replace(value=member(values, i)), {**prior.card, **told}) for i, prior in enumerate(priors)
+        Prior(prior.params._replace(value=member(values, i)), {**prior.card, **system})
+        for i, prior in enumerate(priors)
     ]
 
 

@@ -108,7 +108,7 @@ def fit(config: PretrainConfig, rows: Rows, normalizer: Normalizer, key: Key, *,
     seen = jax.vmap(jax.vmap(normalize, (None, 0)), (None, 0))(normalizer, rows.obs)
     steps = jnp.arange(rows.reward.shape[1])[None]
     counts = (steps >= rows.switch[:, None]) & (steps <= starts) & rows.valid & rows.intact[:, None]
-    returns = jax.vmap(discounted_returns, (0, 0, None))(rows.reward, rows.discount, 0.0)
+    returns = jax.vmap(discounted_returns, (0, 0, None))(rows.reward, rows.discount, jnp.zeros(()))
     middle = jnp.mean(returns, where=counts)
     scale = jnp.std(returns, where=counts) + 1e-6
     known = (jnp.arange(config.batch_size) % 2).astype(jnp.float32)

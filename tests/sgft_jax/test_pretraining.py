@@ -296,9 +296,11 @@ def test_memory_counts_what_is_kept_and_drawn():
         toy.make(), replace(CONFIG, random_transitions=100, replay_capacity=10**9, batch_size=50)
     )
     assert found["random_transitions"] == 100 * row + 8 and found["replay_capacity"] == 10**9 * row + 8  # two counters
-    networks = CONFIG.ensemble_size + 4
+    networks = CONFIG.ensemble_size + 3
     activations = 2 * networks * 50 * sum(CONFIG.network.hidden) * 4
     assert found["batch_size"] == 2 * 50 * CONFIG.updates_per_step * row + activations
+    length = 20 + 22  # 0.9^22 < 10 %
+    assert found["value_episodes"] == 4 * CONFIG.value_episodes * length * (2 * 4 + 4)
 
 
 @pytest.mark.parametrize(
