@@ -81,11 +81,11 @@ class PretrainConfig(checks.Checked):
     """Critic updates of SAC per actor update."""
     ensemble_size: checks.Few = 5
     """Dynamics models that SAC trains alongside, and networks of V_sim."""
-    value_episodes: checks.Count = 32_768
+    value_episodes: checks.Count = 65_536
     """Simulated episodes that V_sim is fitted to, after training. They begin with random actions."""
-    value_updates: checks.Count = 12_000
+    value_updates: checks.Count = 16_000
     """Gradient steps of that fit, with batches of `batch_size` steps."""
-    value_left: Annotated[float, checks.positive, checks.share] = 0.1
+    value_left: Annotated[float, checks.positive, checks.share] = 0.3
     """Share of the discounted weight that is left where these episodes end, past their time limit; there V_sim itself
     stands for what follows."""
     precision: Precision = "default"
@@ -240,7 +240,6 @@ PRESETS: dict[str, PretrainConfig] = {
         ensemble_size=3,
         value_episodes=768,
         value_updates=4000,
-        value_left=0.3,
         chunk_steps=100,
         eval_every=1,
         eval_episodes=32,

@@ -299,7 +299,7 @@ def test_memory_counts_what_is_kept_and_drawn():
     networks = CONFIG.ensemble_size + 3
     activations = 2 * networks * 50 * sum(CONFIG.network.hidden) * 4
     assert found["batch_size"] == 2 * 50 * CONFIG.updates_per_step * row + activations
-    length = 20 + 22  # 0.9^22 < 10 %
+    length = 20 + 12  # 0.9^12 < 30 %
     assert found["value_episodes"] == 4 * CONFIG.value_episodes * length * (2 * 4 + 4)
 
 
