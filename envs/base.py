@@ -70,7 +70,8 @@ class Parameter(NamedTuple):
 
         That is grams for kilograms: beyond it no system of the task is meant, and the physics would end as infinities.
         """
-        most = _FARTHEST * (max(abs(self.nominal), abs(self.low), abs(self.high)) or 1.0)
+        known = (self.nominal, self.low, self.high, *(self.real or ()))
+        most = _FARTHEST * (max(map(abs, known)) or 1.0)
         return (self.minimum if self.minimum > -inf else -most), (self.maximum if self.maximum < inf else most)
 
 

@@ -12,7 +12,7 @@ from envs.types import Array, Key, Transition
 from sgft_jax import diagnosis
 from sgft_jax.diagnosis import HORIZONS, Lateness, Rollouts
 from sgft_jax.models.config import network_of
-from sgft_jax.models.distortion import Distortion, Identified, command_interface, none, residuals, undone
+from sgft_jax.models.distortion import Distortion, Identified, Seen, command_interface, none, residuals, undone
 from sgft_jax.stacking import member
 from sgft_jax.types import SimulatedData, Task
 
@@ -118,7 +118,7 @@ def _start(card: Mapping[str, Any], task: Task, params: Any, simulated: Rollouts
         return jax.tree.map(lambda x: x[which], rows)
 
     interface = command_interface(network_of(card), task)
-    return interface.prepare(interface.start(params), SimulatedData(draw, jnp.zeros(1)))
+    return interface.prepare(interface.start(params, jax.random.key(0)), SimulatedData(draw, jnp.zeros(1)))
 
 
 def _look(
@@ -131,7 +131,7 @@ def _look(
     beliefs = diagnosis.beliefs_of(params, card, task)
     rows, valid = rollouts.flat()
     nothing = none(task.act_dim, task.measured_dim)
-    known = command_interface(network_of(card), task).refit(begun, rows, valid).distortion
+    known = command_interface(network_of(card), task).refit(begun, Seen(rows, valid)).distortion
     meant = rollouts._replace(transitions=jax.vmap(functools.partial(undone, known))(rollouts.transitions))
     judged, acted = (meant, known) if real else (rollouts, nothing)
     flat, _ = judged.flat()

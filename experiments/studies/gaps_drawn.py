@@ -27,7 +27,7 @@ from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.math import stats
 from sgft_jax.methods import get_method
 from sgft_jax.models.config import network_of
-from sgft_jax.models.distortion import Distortion, Identified, Interface, command_interface, none
+from sgft_jax.models.distortion import Distortion, Identified, Interface, Seen, command_interface, none
 from sgft_jax.types import Prior, SimulatedData
 
 if TYPE_CHECKING:
@@ -251,11 +251,12 @@ def _identified(part: Interface, priors: int, members: PyTree, explored: Episode
             indices = jax.random.randint(key, (n,), 0, flat.reward.shape[0])
             return jax.tree.map(lambda x: x[indices], flat)
 
-        return part.prepare(part.start(params), SimulatedData(draw, jnp.zeros(1)))
+        return part.prepare(part.start(params, jax.random.key(0)), SimulatedData(draw, jnp.zeros(1)))
 
     sim = jax.vmap(start)(*jax.tree.map(lambda x: x[:priors], (members, rows)))
     everywhere = jax.tree.map(lambda x: jnp.tile(x, (len(held) // priors, *[1] * (x.ndim - 1))), sim)
-    return jax.vmap(part.refit)(everywhere, *jax.tree.map(lambda x: x[:, 0], (rows, held))).distortion
+    first = Seen(*jax.tree.map(lambda x: x[:, 0], (rows, held)))
+    return jax.vmap(part.refit)(everywhere, first).distortion
 
 
 def _plan(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) -> Lines:

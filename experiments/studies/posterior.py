@@ -1,16 +1,15 @@
-"""Which system is this? What replays of real rollouts tell, on systems that are known (docs/rules.md).
+"""Which system is this? What rollouts tell, on systems that are known (docs/rules.md).
 
-Systems are drawn from the prior over what is unknown of a real one, and a prior's policy plays a few rollouts in each.
-gate: the true system and many others from the prior replay them. calibrate: particles of the posterior, at one exponent
-of the likelihood after the other: how often they cover the truth, how far they narrow it, and what the policy that is
-chosen under them promises and does; beside it, what is chosen without data.
+gate: systems are drawn from the prior over what is unknown of a real one, and a shipped prior's policy plays in each;
+the true system and many others replay what it did. calibrate: the posterior of such systems, how often it covers the
+truth, how far it narrows it, and what the policy that is chosen under it promises and does. deploy: the same choice
+after every rollout on drawn development gaps. In both, rollouts 0 is the choice without data.
 """
 
 import functools
 import json
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -20,10 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
+from envs import gaps
 from envs.base import Env, World
 from envs.mujoco.worlds import choose_impl
-from envs.rollout import Episode, play_episode
-from envs.types import Array, Key, PyTree
+from envs.rollout import Episode, play_episode, real_env, real_worlds
+from envs.types import Array, Key, Policy, PyTree, UserError
 from experiments.runner import cli
 from experiments.runner.cli import Json
 from experiments.runner.options import Impl, Out, at_least_one, each_once, seed_list
@@ -32,35 +32,42 @@ from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
 from sgft_jax.io.log import write_summary
 from sgft_jax.io.priors import load_prior, observed
-from sgft_jax.models.distortion import none
+from sgft_jax.models.distortion import Distortion, none
 from sgft_jax.posterior.candidates import Candidates, candidates
-from sgft_jax.posterior.decision import Decision, correction, decide
-from sgft_jax.posterior.replay import Rollout, likelihood, replays, rollout_of
-from sgft_jax.posterior.smc import Likelihood, Particles, begin, sample
-from sgft_jax.stacking import join, member, stack
+from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, play
+from sgft_jax.posterior.estimator import Estimator, draw
+from sgft_jax.posterior.learning import MOST
+from sgft_jax.posterior.replay import Rollout, replays, rollout_of
+from sgft_jax.stacking import member, stack
 
 _BEATEN, _SYSTEMS = 0.9, 0.8  # gate 1: the truth beats so many draws, on so many systems
-EXPONENTS = (0.01, 0.02, 0.05, 0.1, 0.2)
-_CANDIDATES, _JUDGES = 24, 32  # particles whose corrections are tried, and particles that they are tried in
-_EPISODES, _PLAYED = 4, 50  # of a candidate in a particle, and of the chosen one in the true system
+_POINTS = 256  # of a posterior
+_DECIDED = 32  # systems in which that is deployed which is chosen
+_PLAYED = 50  # episodes of what is chosen, in the true system
+_GAPS, _LOOKED, _EVALUATED = 4, 100, 200  # of a task; episodes by which they are chosen, and in which they are judged
+_RUNS = 4  # of a gap
+_AT_ONCE = 8  # systems for which a decision is made in one program
 
 
 @dataclass(frozen=True)
 class PosteriorArgs:
     """One study of replays."""
 
-    parts: tuple[Literal["gate", "calibrate"], ...] = ("gate",)
+    parts: tuple[Literal["gate", "calibrate", "deploy"], ...] = ("gate",)
     """What to measure; the head of this help explains it."""
     tasks: tuple[str, ...] = ("push", "insert", "hammer")
     """Tasks; their shipped priors play."""
     systems: int = 10
-    """Systems a task that are taken for real ones."""
+    """Systems a task that are taken for real ones, for gate and calibrate."""
     rollouts: tuple[int, ...] = (2,)
-    """Rollouts in each of them, one study for each number."""
+    """Rollouts in each of them, one line for each number."""
     draws: int = 1000
     """Other systems that replay the same rollouts, for gate."""
-    particles: int = 128
-    """Particles of the posterior, for calibrate."""
+    priors: Path | None = None
+    """Folder with a prior of each task, TASK/seed-0, that has an estimator; default: those that come with the code."""
+    gaps: tuple[str, ...] = ()
+    """Real systems for deploy, as files of gaps; default: the drawn ones of development. It takes the four on which
+    the policy starts lowest."""
     states: int = 8
     """Expert: states of the filter."""
     seed: int = 0
@@ -71,35 +78,50 @@ class PosteriorArgs:
 
 
 class Setup(NamedTuple):
-    """A task whose systems are known. true: [G, d] systems. rollouts: [G, K] in each.
+    """A task and the policy that plays it.
 
     env: with the observations of the prior's policy. simulator: without what they hold beside measurements.
-    play(distortion, world, key) -> an episode of the prior's policy behind a correction.
+    params: of the policy.
     """
 
     env: Env
     simulator: Env
     systems: Candidates
-    play: Callable[[PyTree, World, Key], Episode]
-    true: Array
-    rollouts: Rollout
+    policy: Policy
+    params: PyTree
+
+    def behind(self, distortion: Distortion | None) -> PyTree:
+        """Params of the policy behind a correction."""
+        return self.params._replace(distortion=distortion, estimator=None)
+
+    def nothing(self) -> Distortion:
+        """The correction that changes nothing."""
+        return none(self.env.act_dim, self.env.measured_dim)
+
+    def success(self, distortion: Distortion, point: Array, key: Key) -> Array:
+        """[] bool, of an episode of the policy behind a correction in the system at a point [d]."""
+        key_world, key_play = jax.random.split(key)
+        world = self.systems.episode(point, key_world)
+        return play(self.env, self.policy, self.behind(distortion), world, key_play).success
 
 
 def main(args: PosteriorArgs) -> None:
     """Measures, prints and writes the numbers to <out>/posterior/summary.json."""
-    at_least_one(args, "systems", "rollouts", "draws", "particles", "states")
+    at_least_one(args, "systems", "rollouts", "draws", "states")
     each_once(args, "parts", "tasks", "rollouts")
     seed_list(args.seed, 1)
+    if max(args.rollouts) > MOST:
+        raise UserError(f"--rollouts {max(args.rollouts)}: at most {MOST} are read together")
     folder = args.out / "posterior"
     summary: dict[str, Any] = {part: [] for part in args.parts}
     for task in args.tasks:
-        for count in args.rollouts:
-            setup = _set_up(args, task, count)
-            for part in args.parts:
-                lines = {"gate": _gate, "calibrate": _calibrate}[part](args, setup)
-                summary[part] += [{"task": task, "rollouts": count} | line for line in lines]
-                folder.mkdir(parents=True, exist_ok=True)
-                write_summary(folder, summary)
+        setup = _set_up(args, task)
+        for part in args.parts:
+            lines = {"gate": _gate, "calibrate": _calibrate, "deploy": _deploy}[part](args, setup)
+            summary[part] += [{"task": task} | line for line in lines]
+            folder.mkdir(parents=True, exist_ok=True)
+            write_summary(folder, summary)
+            print(_table(summary[part]), file=sys.stderr, flush=True)
     if args.json:
         print(json.dumps(summary))
         return
@@ -108,46 +130,49 @@ def main(args: PosteriorArgs) -> None:
     print(f"numbers: {folder / 'summary.json'}")
 
 
-def _set_up(args: PosteriorArgs, task: str, count: int) -> Setup:
+def _set_up(args: PosteriorArgs, task: str) -> Setup:
     """The task, its systems and what is played in them."""
-    prior = load_prior(f"shipped:{task}/seed-0")
+    prior = load_prior(f"shipped:{task}/seed-0" if args.priors is None else args.priors / task / "seed-0")
     impl = choose_impl(args.impl)
     env, simulator = envs.make(task, impl, **observed(prior.card)), envs.make(task, impl)
     policy = make_policy(prior.card, env)
     with doing(f"compiling the simulator and worlds of {task}", 40, once=True):
         simulator.prepare()
         systems = candidates(simulator)
-    key_systems, key_play = jax.random.split(jax.random.key(args.seed))
-    true = systems.draw(key_systems, args.systems)
+    return Setup(env, simulator, systems, policy, prior.params)
 
-    def play(distortion: PyTree, world: World, key: Key) -> Episode:
-        act = functools.partial(policy.act, prior.params._replace(distortion=distortion), explore=False)
-        return play_episode(env, jax.tree.map(lambda x: x[None], world), act, policy.init_carry(), key, gamma=1.0)
+
+def _played(args: PosteriorArgs, setup: Setup, count: int) -> tuple[Array, Rollout]:
+    """Systems [G, d] and `count` rollouts [G, count] in each."""
+    key_systems, key_play = jax.random.split(jax.random.key(args.seed))
+    true = setup.systems.draw(key_systems, args.systems)
 
     def record(point: Array, key: Key) -> Rollout:
         key_world, key_episode = jax.random.split(key)
-        return rollout_of(env, play(None, systems.episode(point, key_world), key_episode))
+        params, world = setup.behind(setup.nothing()), setup.systems.episode(point, key_world)
+        episode = play(setup.env, setup.policy, params, world, key_episode)
+        return rollout_of(setup.env, episode.transitions, episode.valid, episode.success)
 
     with doing(f"playing {args.systems * count} rollouts", 20):
         keys = jax.random.split(key_play, (args.systems, count))
-        rollouts = jax.jit(jax.vmap(jax.vmap(record, (None, 0))))(true, keys)
-    return Setup(env, simulator, systems, play, true, rollouts)
+        return true, jax.jit(jax.vmap(jax.vmap(record, (None, 0))))(true, keys)
 
 
 def _gate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
     """Gate 1 on one task."""
     key_draws, key_replay = jax.random.split(jax.random.key(args.seed + 1))
     others = setup.systems.draw(key_draws, args.draws)
+    true, rollouts = _played(args, setup, args.rollouts[0])
 
-    def explain(point: Array, rollouts: Rollout, key: Key) -> tuple[Array, Array]:
-        evidence = replays(setup.simulator, setup.systems, point, rollouts, key, states=args.states)
+    def explain(point: Array, real: Rollout, key: Key) -> tuple[Array, Array]:
+        evidence = replays(setup.simulator, setup.systems, point, real, key, states=args.states)
         return evidence.log_likelihood.sum(), evidence.success
 
     replayed = jax.jit(jax.vmap(explain, (0, None, 0)))
     beaten, right, seconds = [], [], []
     for number in range(args.systems):
-        real = member(setup.rollouts, number)
-        points = jnp.concatenate([setup.true[number : number + 1], others])
+        real = member(rollouts, number)
+        points = jnp.concatenate([true[number : number + 1], others])
         keys = jax.random.split(jax.random.fold_in(key_replay, number), len(points))
         begun = time.perf_counter()
         with doing(f"replaying in {len(points)} systems", 30, once=True):
@@ -156,14 +181,14 @@ def _gate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
         beaten.append(float((total[0] > total[1:]).mean()))
         right.append(float(np.where(real.success, success[0], 1.0 - success[0]).mean()))
     simulator, passed = setup.simulator, float(np.mean(np.array(beaten) >= _BEATEN))
-    count = (args.draws + 1) * setup.rollouts.success.shape[1] * args.states
+    count = (args.draws + 1) * rollouts.success.shape[1] * args.states
     steps = count * simulator.episode_length * envs.scene(simulator.name).substeps
     return [
         {
             "systems passed": passed,
             "least beaten": min(beaten),
             "outcome right": float(np.mean(right)),
-            "success": float(np.mean(setup.rollouts.success)),
+            "success": float(np.mean(rollouts.success)),
             "first s": seconds[0],
             "replay s": min(seconds),
             "steps per s": steps / min(seconds),
@@ -173,88 +198,198 @@ def _gate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
 
 
 def _calibrate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
-    """A line for the prior and for each exponent."""
-    keys = jax.random.split(jax.random.key(args.seed + 2), args.systems)
-    points = jax.vmap(lambda key: setup.systems.draw(key, args.particles))(keys)
+    """A line for each number of rollouts."""
+    estimator = _estimator(setup)
+    true, rollouts = _played(args, setup, max(args.rollouts))
 
-    def explain(rollouts: Rollout) -> Likelihood:
-        return likelihood(setup.simulator, setup.systems, rollouts, states=args.states)
-
-    first = jax.jit(jax.vmap(lambda rollouts, points, key: begin(explain(rollouts), points, key)))
-    further = jax.jit(
-        jax.vmap(lambda rollouts, *rest: sample(explain(rollouts), *rest[:2], exponent=rest[2]), (0, 0, 0, None))
-    )
-    judged = jax.jit(jax.vmap(functools.partial(_decide, setup)))
-    lines, begun = [], time.perf_counter()
-    with doing("replaying in the systems of the prior", 30, once=True):
-        particles = jax.block_until_ready(first(setup.rollouts, points, keys))
-    for exponent in (0.0, *EXPONENTS):
-        if exponent:
-            with doing(f"sampling the posterior with exponent {exponent}", 60):
-                particles = further(setup.rollouts, particles, keys, jnp.float32(exponent))
-                particles = jax.block_until_ready(particles)
-        seconds = time.perf_counter() - begun
-        with doing("playing in particles what may be deployed", 30, once=True):
-            decision, played = jax.device_get(judged(particles.points, setup.true, keys))
-        lines.append(_line(setup, particles, decision, played, exponent, seconds))
-        print(_table(lines[-1:]), file=sys.stderr, flush=True)
-        begun = time.perf_counter()
+    judged = jax.jit(functools.partial(_judged, setup, estimator, true, _padded(rollouts)))
+    lines = []
+    for number in (0, *args.rollouts):
+        with doing("playing in particles what may be deployed", 60):
+            points, *books = jax.device_get(judged(jnp.arange(MOST) < number, jax.random.key(args.seed + 2)))
+        lines.append({"rollouts": number} | _covered(setup, points, np.asarray(true)) | _kept(*books))
     return lines
 
 
-def _decide(setup: Setup, points: Array, true: Array, key: Key) -> tuple[Decision, Array]:
-    """What is chosen under particles [n, d], and the success [2] of the prior and of that in the true system."""
-    key_decide, key_played = jax.random.split(key)
-    undo = jax.vmap(lambda point: correction(setup.env, setup.systems.unknowns, point))
-    tried = undo(points[:_CANDIDATES])
-    acting = join([stack([none(setup.env.act_dim, setup.env.measured_dim)]), tried])
+def _judged(
+    setup: Setup, estimator: Estimator, true: Array, rollouts: Rollout, counts: Array, key: Key
+) -> tuple[Array, Array, Array, Array]:
+    """Points [G, n, d] of the posteriors of systems [G, d]; in the first of these what is promised for the chosen
+    candidate, the success of the policy as it is and of that candidate.
+    """
+    keys = jax.random.split(key, (2, len(true)))
+    points = jax.vmap(lambda *row: _points(setup, estimator, row[0], counts, row[1]))(rollouts, keys[0])
 
-    def success(distortion: PyTree, world: World, key: Key) -> Array:
-        return setup.play(distortion, world, key).success
+    def one(row: tuple[Array, Array, Key]) -> tuple[Array, Array, Array]:
+        true, points, key = row
+        key_choose, key_played = jax.random.split(key)
+        deployed, promised = choose(setup.env, setup.systems, setup.policy, setup.behind(None), points, key_choose)
+        both, keys = stack([setup.nothing(), deployed]), jax.random.split(key_played, _PLAYED)
+        played = jax.vmap(jax.vmap(setup.success, (None, None, 0)), (0, None, None))(both, true, keys).mean(axis=1)
+        return promised, played[0], played[1]
 
-    judges = points[-_JUDGES:]
-    decision = decide(success, acting, setup.systems, judges, key_decide, episodes=_EPISODES)
+    few = points[:, -CANDIDATES - JUDGES :]
+    first = jax.tree.map(lambda x: x[:_DECIDED], (true, few, keys[1]))
+    return points, *jax.lax.map(one, first, batch_size=_AT_ONCE)
 
-    def play(number: Array, key: Key) -> Array:
-        key_world, key_play = jax.random.split(key)
-        return success(member(acting, number), setup.systems.episode(true, key_world), key_play)
 
-    keys = jax.random.split(key_played, _PLAYED)
-    of_both = jax.vmap(jax.vmap(play, (None, 0)), (0, None))(
-        jnp.stack([jnp.zeros_like(decision.chosen), decision.chosen]), keys
+def _deploy(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
+    """Gate 2: a line for each number of rollouts, over the gaps on which the policy starts lowest."""
+    estimator, key = _estimator(setup), jax.random.key(args.seed)
+    key_worlds, key_look, key_before, key_run = jax.random.split(key, 4)
+    real = _real(args, setup, key_worlds)
+    evaluate = jax.jit(functools.partial(_success, setup, real), static_argnames="episodes")
+    with doing("playing the policy as it is", 60):
+        look = evaluate(setup.nothing(), jnp.arange(len(real.names)), key_look, episodes=_LOOKED)
+        lowest = np.argsort(np.asarray(look))[:_GAPS]
+        which = jnp.asarray(np.repeat(lowest, _RUNS))
+        before = evaluate(setup.nothing(), which, key_before, episodes=_EVALUATED)
+    first = jax.tree.map(lambda x: jnp.repeat(x[None], len(which), axis=0), setup.nothing())
+    shape = jax.eval_shape(functools.partial(_rollout, setup, real), which[0], setup.nothing(), key)
+    runs = _Runs(which, first, jax.tree.map(lambda x: jnp.zeros((len(which), MOST, *x.shape), x.dtype), shape))
+    step = jax.jit(functools.partial(_adapted, setup, real, estimator))
+    lines = []
+    for number in range(max(args.rollouts) + 1):
+        with doing("playing, and choosing what to deploy", 60):
+            runs, promised, played = step(runs, jnp.int32(number), jax.random.fold_in(key_run, number))
+        names = [real.names[i] for i in np.asarray(which)]
+        by_gap = {
+            name: [float(np.mean([x[i] for i, other in enumerate(names) if other == name])) for x in (before, played)]
+            for name in names
+        }
+        numbers = (np.asarray(x) for x in (promised, before, played))
+        lines.append({"rollouts": number} | _kept(*numbers) | {"gaps": by_gap})
+    return lines
+
+
+class _Real(NamedTuple):
+    """Real systems: their env, pools of their worlds [gaps, n], and what they are called."""
+
+    env: Env
+    pool: World
+    names: list[str]
+
+
+class _Runs(NamedTuple):
+    """Runs [R]: which real system each is in, what it deploys, and the rollouts [R, MOST] that it has played."""
+
+    which: Array
+    deployed: Distortion
+    rollouts: Rollout
+
+
+def _real(args: PosteriorArgs, setup: Setup, key: Key) -> _Real:
+    """The gaps of a task that are asked for, by default the drawn ones of development."""
+    sources = args.gaps or (f"envs/gaps/development/{setup.env.name}-drawn.toml",)
+    drawn = [gaps.load(setup.env, source) for source in gaps.each(sources)]
+    env = real_env(setup.env, drawn)
+    with doing(f"compiling {len(drawn)} real systems of {setup.env.name}", 40):
+        return _Real(env, real_worlds(env, drawn, key), [gap.name for gap in drawn])
+
+
+def _success(setup: Setup, real: _Real, deployed: Distortion, which: Array, key: Key, *, episodes: int) -> Array:
+    """[R] success in real systems [R] of what is deployed, in one of them or [R]."""
+
+    def one(deployed: Distortion, which: Array, key: Key) -> Array:
+        def play(key: Key) -> Array:
+            return _play(setup, real, which, deployed, key).success
+
+        return jax.vmap(play)(jax.random.split(key, episodes)).mean()
+
+    alike = deployed.bias.ndim == 1
+    return jax.vmap(one, (None if alike else 0, 0, 0))(deployed, which, jax.random.split(key, len(which)))
+
+
+def _play(setup: Setup, real: _Real, which: Array, deployed: Distortion, key: Key, explore: bool = False) -> Episode:
+    """An episode in a real system."""
+    act = functools.partial(setup.policy.act, setup.behind(deployed), explore=explore)
+    return play_episode(real.env, real.pool, act, setup.policy.init_carry(), key, gamma=1.0, which=which)
+
+
+def _rollout(setup: Setup, real: _Real, which: Array, deployed: Distortion, key: Key) -> Rollout:
+    """One that trains, so it explores."""
+    episode = _play(setup, real, which, deployed, key, explore=True)
+    return rollout_of(real.env, episode.transitions, episode.valid, episode.success)
+
+
+def _adapted(
+    setup: Setup, real: _Real, estimator: Estimator, runs: _Runs, number: Array, key: Key
+) -> tuple[_Runs, Array, Array]:
+    """Runs after a decision upon `number` rollouts, of which they play the last one; what was promised [R] for what is
+    chosen, and its success [R]. Without data nothing of the choice is deployed.
+    """
+    key_play, key_choose, key_evaluate = jax.random.split(key, 3)
+    keys_play, keys_choose = (jax.random.split(key, len(runs.which)) for key in (key_play, key_choose))
+    new = jax.vmap(functools.partial(_rollout, setup, real))(runs.which, runs.deployed, keys_play)
+    last = jnp.arange(MOST) == number - 1
+
+    def put(rows: Array, row: Array) -> Array:
+        return jnp.where(last.reshape(-1, *[1] * (row.ndim - 1)), row[:, None], rows)
+
+    rollouts = jax.tree.map(put, runs.rollouts, new)
+
+    def decide(row: tuple[Rollout, Key]) -> tuple[Distortion, Array]:
+        key_points, key_decide = jax.random.split(row[1])
+        points = _points(setup, estimator, row[0], jnp.arange(MOST) < number, key_points)
+        few = points[-CANDIDATES - JUDGES :]
+        return choose(setup.env, setup.systems, setup.policy, setup.behind(None), few, key_decide)
+
+    chosen, promised = jax.lax.map(decide, (rollouts, keys_choose), batch_size=_AT_ONCE)
+    played = _success(setup, real, chosen, runs.which, key_evaluate, episodes=_EVALUATED)
+    deployed = jax.tree.map(lambda a, b: jnp.where(number > 0, a, b), chosen, runs.deployed)
+    return _Runs(runs.which, deployed, rollouts), promised, played
+
+
+def _estimator(setup: Setup) -> Estimator:
+    if setup.params.estimator is None:
+        raise UserError("--priors: have no estimator; `python -m experiments.estimate` gives them one")
+    return setup.params.estimator
+
+
+def _points(setup: Setup, estimator: Estimator, rollouts: Rollout, counts: Array, key: Key) -> Array:
+    """[n, d] points of the posterior, or of the prior where no rollout counts."""
+    key_prior, key_draw = jax.random.split(key)
+    prior = setup.systems.draw(key_prior, _POINTS)
+    told = draw(estimator, rollouts, counts, prior.shape[1], key_draw, _POINTS)
+    return jnp.where(counts.any(), told, prior)
+
+
+def _padded(rollouts: Rollout) -> Rollout:
+    """Rollouts [G, k] as [G, MOST]."""
+    return jax.tree.map(
+        lambda x: jnp.concatenate([x, jnp.zeros((len(x), MOST - x.shape[1], *x.shape[2:]), x.dtype)], axis=1), rollouts
     )
-    return decision, of_both.mean(axis=1)
 
 
-def _line(
-    setup: Setup, particles: Particles, decision: Decision, played: np.ndarray, exponent: float, seconds: float
-) -> dict[str, Any]:
-    """What particles [G, n] say of the true systems [G]."""
-    points, true = np.asarray(particles.points), np.asarray(setup.true)
+def _covered(setup: Setup, points: np.ndarray, true: np.ndarray) -> dict[str, Any]:
+    """What posteriors [G, n, d] say of the true systems [G, d]."""
     below = (points < true[:, None]).mean(axis=1)
     inside = (below > 0.1) & (below < 0.9)
-    mean, std = points.mean(axis=1), np.maximum(points.std(axis=1), 1e-3)
-    score = -0.5 * ((true - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)
-    gain = decision.promised - played[:, 1]
+    std = np.maximum(points.std(axis=1), 1e-3)
+    score = -0.5 * ((true - points.mean(axis=1)) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)
+    width = 12**0.5 * std.mean(axis=0)
     return {
-        "exponent": exponent,
         "inside 80": float(inside.mean()),
         "least inside": float(inside.mean(axis=0).min()),
+        "most inside": float(inside.mean(axis=0).max()),
         "log score": float(np.clip(score, -20.0, None).mean()),
-        "std": float(std.mean() * 12**0.5),
-        "ancestors": float(np.mean([len(np.unique(x)) for x in np.asarray(particles.ancestor)])),
-        "acceptance": float(np.mean(particles.acceptance)),
-        "stages": int(np.max(particles.stages)),
-        "zero-shot": float(played[:, 0].mean()),
-        "played": float(played[:, 1].mean()),
-        "promised": float(np.mean(decision.promised)),
-        "overestimate": float(gain.mean()),
-        "worst fall": float((played[:, 0] - played[:, 1]).max()),
-        "seconds": seconds,
+        "std": float(width.mean()),
         "by unknown": {
-            f"{u.name}[{u.index}]": [float(inside[:, i].mean()), float(std[:, i].mean() * 12**0.5)]
+            f"{u.name}[{u.index}]": [float(inside[:, i].mean()), float(width[i])]
             for i, u in enumerate(setup.systems.unknowns)
         },
+    }
+
+
+def _kept(promised: np.ndarray, before: np.ndarray, played: np.ndarray) -> dict[str, float]:
+    """What was promised [G] for what is deployed, what that did, and the policy as it is."""
+    return {
+        "zero-shot": float(before.mean()),
+        "played": float(played.mean()),
+        "promised": float(promised.mean()),
+        "overestimate": float((promised - played).mean()),
+        "error": float(np.sqrt(np.mean((promised - played) ** 2))),
+        "worst fall": float((before - played).max()),
     }
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Any, NotRequired
 
 from msgspec import Meta, Struct
 
-from envs.types import Array, Policy, PyTree
+from envs.types import Array, Policy, PyTree, UserError
 from sgft_jax import data, learners
 from sgft_jax.algorithms.base import (
     Algorithm,
@@ -28,11 +28,18 @@ class _Plan(Struct, forbid_unknown_fields=True):
     noise: Annotated[float, Meta(ge=0)] = 0.0
 
 
+class _Estimator(Struct, forbid_unknown_fields=True):
+    unknowns: list[VaryingEntry]
+    steps: Width
+    measured: Width
+
+
 class _SACCard(Card):
     network: NetworkEntry
     critic_network: NotRequired[NetworkEntry | None]
     plan: NotRequired[_Plan | None]
     value_system: NotRequired[list[VaryingEntry]]
+    estimator: NotRequired[_Estimator | None]
 
 
 def _policy(card: Mapping[str, Any], task: Task) -> Policy:
@@ -58,6 +65,19 @@ def _networks(card: Mapping[str, Any], params: Any) -> Networks:
     if params.dynamics is not None:
         ensemble = networks.make_dynamics(*sizes, network, members=_members(params.dynamics))
         yield "dynamics", ensemble, params.dynamics
+    if params.estimator is not None:
+        yield "estimator", _estimator(card), params.estimator
+
+
+def _estimator(card: Mapping[str, Any]) -> Any:
+    """Of the shapes that a card tells; raises UserError where it tells nothing of an estimator."""
+    from sgft_jax.models.networks import Network
+    from sgft_jax.posterior.estimator import shaped
+
+    if not (entry := card.get("estimator")):
+        raise UserError("has an estimator, of which its card says nothing; make it anew, or take another prior")
+    sizes = entry["steps"], entry["measured"], card["act_dim"], len(entry["unknowns"])
+    return Network(lambda key: shaped(*sizes), lambda params, *inputs: params)
 
 
 def _value_network(card: Mapping[str, Any], params: PyTree) -> Any:

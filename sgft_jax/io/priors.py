@@ -20,6 +20,7 @@ from sgft_jax.io import checkpoint
 from sgft_jax.io.cards import CARD, read_card, resolve_shipped
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.networks import Network, check_params
+from sgft_jax.posterior.estimator import Estimator, Statistics
 from sgft_jax.types import Normalizer, Prior
 
 __all__ = ["load_prior", "save_prior"]
@@ -86,7 +87,19 @@ def _params(card: Mapping[str, Any], paths: Sequence[str], leaves: Sequence[Any]
             if not isinstance(part, dict) or set(part) != set(kind._fields):
                 raise UserError(f"its {name} is not of {', '.join(kind._fields)}; pretrain again")
             tree[name] = kind(**part)
+    if (part := tree.get("estimator")) is not None:
+        tree["estimator"] = _estimator(part)
     return container(**{name: tree.get(name) for name in container._fields})
+
+
+def _estimator(part: Any) -> Estimator:
+    """The estimator that a tree of dicts describes."""
+    if not isinstance(part, dict) or set(part) != set(Estimator._fields):
+        raise UserError(f"its estimator is not of {', '.join(Estimator._fields)}; make it anew")
+    known = part["statistics"]
+    if not isinstance(known, dict) or set(known) != set(Statistics._fields):
+        raise UserError(f"the statistics of its estimator are not {', '.join(Statistics._fields)}; make it anew")
+    return Estimator(part["params"], Statistics(**known))
 
 
 def _check_parameters(card: Mapping[str, Any], params: Any, described: Iterable[tuple[str, Network, PyTree]]) -> None:
@@ -173,7 +186,7 @@ def digest(prior: Prior) -> str:
 def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for policies that run in one program."""
     algorithm = algorithm_of(card)
-    shared = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
+    shared = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan", "estimator")}
     shared |= {name: card["config"][name] for name in algorithm.program}
     return shared | {
         "algorithm": algorithm.name,

@@ -125,6 +125,7 @@ class SACParams(NamedTuple):
     normalizer: statistics of the random-action data; every network above reads normalised observations.
     distortion: what the real system makes of commands, None = nothing.
     system: [k] what the actor is told of the system at the end of its observation, None = what stands there.
+    estimator: which system makes which rollouts, `posterior.estimator.Estimator`, or None.
     """
 
     actor: PyTree
@@ -134,6 +135,7 @@ class SACParams(NamedTuple):
     normalizer: Normalizer
     distortion: Distortion | None = None
     system: Array | None = None
+    estimator: PyTree = None
 
 
 class SACState(struct.PyTreeNode):

@@ -21,7 +21,8 @@ Kind = Literal["online", "fixed"]
 
 # Of tables and figures: the ones to try first stand first, what is not listed last.
 _ORDER = (
-    *("guarded", "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "sgft", "tdmpc2", "mbpo", "sysid", "recurrent"),
+    *("guarded", "posterior", "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "sgft", "tdmpc2", "mbpo", "sysid"),
+    *("recurrent",),
     *("h2oplus", "h2oplus-edac", "h2o", "darc", "sac", "rlpd", "sac-online", "iql", "cql", "rebrac", "edac"),
     *("sac-reset", "pbrs", "pbrs-branch", "frozen-critic", "sgft-tdmpc2-code", "sgft-parts"),
 )

@@ -6,18 +6,18 @@ learns. The learner sees the simulator's actions and measurements; this module t
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.types import Array, PyTree, Transition
+from envs.types import Array, Key, PyTree, Transition
 from sgft_jax.models import dynamics
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import make_dynamics
 from sgft_jax.models.robust import most_probable, spread_of
-from sgft_jax.types import Batch, Normalizer, SimulatedData, Task
+from sgft_jax.types import Batch, Metrics, Normalizer, SimulatedData, Task
 
 _TURN, _SCALE, _BIAS = 0.6, 0.4, 0.2  # std of the rotation (rad), log-scales and biases before any data
 FURTHEST = 2.0  # std of a sensor's error
@@ -162,24 +162,42 @@ class Identified(NamedTuple):
     distortion: Distortion
 
 
-class Interface(NamedTuple):
-    """Identification as pure functions.
-
-    start(params of a prior) -> Identified, before any row. prepare(identified, simulated) -> the same with the spread.
-    refit(identified, rows [n], held [n] bool) -> Identified, fitted to the rows that `held` marks.
-    meant(identified, batch) -> the batch, its real rows translated into the simulator's actions and measurements.
+class Seen(NamedTuple):
+    """What has been seen of a real system: rows [n] that are kept, which of them are `held` [n] bool, and of the last
+    rollout its rows [T], which of them are valid [T], and whether it succeeded [].
     """
 
-    start: Callable[[PyTree], Identified]
-    prepare: Callable[[Identified, SimulatedData], Identified]
-    refit: Callable[[Identified, Transition, Array], Identified]
-    meant: Callable[[Identified, Batch], Batch]
+    rows: Transition
+    held: Array
+    rollout: tuple[Transition, Array, Array] | None = None
+
+
+class Interface(NamedTuple):
+    """Identification as pure functions. What is known of a system, such as `Identified`, has a `distortion`.
+
+    start(params of a prior, key) -> what is known before any row. prepare(known, simulated) -> the same with the
+    spread. refit(known, seen) -> what is known then. report(known) -> metrics.
+    """
+
+    start: Callable[[PyTree, Key], Any]
+    prepare: Callable[[Any, SimulatedData], Any]
+    refit: Callable[[Any, Seen], Any]
+    report: Callable[[Any], Metrics] = lambda known: {}
+
+
+def translated(distortion: Distortion, batch: Batch) -> Batch:
+    """The batch, its real rows in the simulator's actions and measurements."""
+    new = undone(distortion, batch)
+    if (simulated := batch.is_sim) is None:
+        return new
+    return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, new)
 
 
 def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Interface:
     """Identification for a task. model(params, obs, action) -> [measured_dim]; kept(prior's params) -> its params."""
 
-    def start(params: PyTree) -> Identified:
+    def start(params: PyTree, key: Key) -> Identified:
+        del key
         unknown = jnp.zeros(task.measured_dim)
         return Identified(jax.tree.map(jnp.copy, kept(params)), unknown, none(task.act_dim, task.measured_dim))
 
@@ -189,8 +207,8 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
         change = (rows.next_obs - rows.obs)[:, : missed.shape[1]]
         return known._replace(spread=spread_of(missed, change, held))
 
-    def refit(known: Identified, rows: Transition, held: Array) -> Identified:
-        rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))
+    def refit(known: Identified, seen: Seen) -> Identified:
+        rows, held = jax.tree.map(lambda x: x[:_ROWS], (seen.rows, seen.held))
         options = {"turns": task.cartesian, "errors": task.sensor_errors}
         fitted, evidence = fit(lambda *x: model(known.params, *x), rows, held, known.spread, **options)
         nothing = none(task.act_dim, task.measured_dim)
@@ -198,13 +216,7 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
             distortion=jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), fitted, nothing)
         )
 
-    def meant(known: Identified, batch: Batch) -> Batch:
-        new = undone(known.distortion, batch)
-        if (simulated := batch.is_sim) is None:
-            return new
-        return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, new)
-
-    return Interface(start, prepare, refit, meant)
+    return Interface(start, prepare, refit)
 
 
 def command_interface(network: NetworkConfig, task: Task) -> Interface:

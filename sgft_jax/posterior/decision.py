@@ -3,6 +3,7 @@
 Candidates are the prior as it is, and the prior behind what undoes a particle's errors of commands and sensors.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,23 +12,29 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Env, World
-from envs.types import Array, Key, PyTree
+from envs.rollout import Episode, play_episode
+from envs.types import Array, Key, Policy, PyTree
 from sgft_jax.models.distortion import Distortion, none, turned_and_scaled
 from sgft_jax.posterior.candidates import Candidates, Unknown, values
+from sgft_jax.stacking import join, member, stack
 
+_FINALISTS = 4
 _CLEARLY = 2.0  # standard errors of the difference by which a candidate beats the prior as it is
 _LEAST = 0.02  # and at least so much
+
+CANDIDATES, JUDGES = 16, 32  # points of the posterior whose corrections are tried, and in which they are tried
+_EPISODES = 2  # that a finalist plays in each
 
 Play = Callable[[PyTree, World, Key], Array]  # (what acts, a world, key) -> [] bool, success of an episode there
 
 
 class Decision(NamedTuple):
-    """chosen: [] number of the candidate to deploy, 0 for the prior as it is. table: [J, I] expected success of each
-    candidate in each particle. promised: [] mean of the chosen one over particles.
+    """chosen: [] number of the candidate to deploy, 0 for the prior as it is. expected: [F] success of the finalists
+    over particles, the prior's first. promised: [] of the chosen one.
     """
 
     chosen: Array
-    table: Array
+    expected: Array
     promised: Array
 
 
@@ -47,14 +54,52 @@ def correction(env: Env, unknowns: tuple[Unknown, ...], point: Array) -> Distort
     return turned_and_scaled(rotation, log_scale, undo.bias, undo.offset)
 
 
+def play(env: Env, policy: Policy, params: PyTree, world: World, key: Key, *, explore: bool | Array = False) -> Episode:
+    """An episode of a policy in a simulated world."""
+    act = functools.partial(policy.act, params, explore=explore)
+    return play_episode(env, jax.tree.map(lambda x: x[None], world), act, policy.init_carry(), key, gamma=1.0)
+
+
+def choose(
+    env: Env, candidates: Candidates, policy: Policy, params: PyTree, points: Array, key: Key
+) -> tuple[Distortion, Array]:
+    """Behind which correction to deploy a policy, and what success [] to expect, by points [CANDIDATES + JUDGES, d] of
+    a posterior. params: what the policy acts by, with a distortion that is replaced.
+    """
+    undo = jax.vmap(lambda point: correction(env, candidates.unknowns, point))(points[:CANDIDATES])
+    acting = join([stack([none(env.act_dim, env.measured_dim)]), undo])
+
+    def success(distortion: Distortion, world: World, key: Key) -> Array:
+        return play(env, policy, params._replace(distortion=distortion), world, key).success
+
+    decision = decide(success, acting, candidates, points[CANDIDATES:], key, episodes=_EPISODES)
+    return member(acting, decision.chosen), decision.promised
+
+
 def decide(
     play: Play, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int
 ) -> Decision:
     """The candidate of the highest expected success; the prior as it is unless another is clearly better.
 
-    acting: [J] candidates, the prior as it is first. particles: [I, d]. All candidates play the same episodes, so that
-    their differences are paired.
+    acting: [J] candidates, the prior as it is first. particles: [I, d]. Everyone plays one episode in each particle;
+    the best go on with `episodes` fresh ones, by which they are judged, so that luck is not promised. All play the
+    same episodes: their differences are paired.
     """
+    key_first, key_final = jax.random.split(key)
+    first = _table(play, acting, candidates, particles, key_first, episodes=1)
+    best = 1 + jax.lax.top_k(first[1:].mean(axis=1), min(_FINALISTS, len(first) - 1))[1]
+    finalists = jnp.concatenate([jnp.zeros(1, best.dtype), best])
+    table = _table(play, member(acting, finalists), candidates, particles, key_final, episodes=episodes)
+    gains = table - table[:1]
+    error = gains.std(axis=1) / np.sqrt(len(particles))
+    clear = gains.mean(axis=1) > jnp.maximum(_CLEARLY * error, _LEAST)
+    expected = table.mean(axis=1)
+    winner = jnp.argmax(jnp.where(clear, expected, -1.0).at[0].set(expected[0]))
+    return Decision(finalists[winner], expected, expected[winner])
+
+
+def _table(play: Play, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int) -> Array:
+    """[J, I] success of each candidate in each particle."""
     keys = jax.random.split(key, (len(particles), episodes))
 
     def of_particle(acts: PyTree, point: Array, keys: Key) -> Array:
@@ -64,9 +109,4 @@ def decide(
 
         return jax.vmap(episode)(keys).mean()
 
-    table = jax.vmap(jax.vmap(of_particle, (None, 0, 0)), (0, None, None))(acting, particles, keys)
-    gains = table - table[:1]
-    error = gains.std(axis=1) / np.sqrt(len(particles))
-    clear = gains.mean(axis=1) > jnp.maximum(_CLEARLY * error, _LEAST)
-    chosen = jnp.argmax(jnp.where(clear, table.mean(axis=1), -1.0).at[0].set(table[0].mean()))
-    return Decision(chosen, table, table[chosen].mean())
+    return jax.vmap(jax.vmap(of_particle, (None, 0, 0)), (0, None, None))(acting, particles, keys)

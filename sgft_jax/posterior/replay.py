@@ -15,10 +15,8 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Effects, Env, EnvState, World
-from envs.rollout import Episode
-from envs.types import Array, Key, UserError
+from envs.types import Array, Key, Transition, UserError
 from sgft_jax.posterior.candidates import Candidates
-from sgft_jax.posterior.smc import Likelihood, systematic
 
 # Of Student's t, which forgives a measurement that is far off, and still tells far from farther: with a floor under a
 # step's likelihood nearly all systems were equally bad, and nothing led to the true one.
@@ -54,11 +52,10 @@ class Evidence(NamedTuple):
     success: Array
 
 
-def rollout_of(env: Env, episode: Episode) -> Rollout:
-    """A recorded episode, without what observations hold beside measurements."""
-    first, rows = episode.transitions.obs[:1], episode.transitions.next_obs
-    measured = jnp.concatenate([first, rows])[:, : env.measured_dim]
-    return Rollout(measured, episode.transitions.action, episode.valid, episode.success)
+def rollout_of(env: Env, rows: Transition, valid: Array, success: Array) -> Rollout:
+    """A recorded episode, without what observations hold beside measurements. rows, valid: [T]."""
+    measured = jnp.concatenate([rows.obs[:1], rows.next_obs])[:, : env.measured_dim]
+    return Rollout(measured, rows.action, valid, success)
 
 
 def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key: Key, *, states: int = 8) -> Evidence:
@@ -84,7 +81,7 @@ def replay(env: Env, candidates: Candidates, point: Array, rollout: Rollout, key
         keys = jax.random.split(key_step, states)
         after = jax.vmap(env.step, (0, 0, None, 0))(here, _jolted(before, key_jolt), action, keys)
         log_weights = jax.vmap(weigh, (0, None))(after, measured)
-        chosen = systematic(key_choice, log_weights)
+        chosen = _systematic(key_choice, log_weights)
         moved = jax.tree.map(lambda x: x[chosen], (which, after))
         carry = jax.tree.map(lambda new, old: jnp.where(valid, new, old), moved, carry)
         return carry, jnp.where(valid, jax.nn.logsumexp(log_weights) - jnp.log(states), 0.0)
@@ -102,13 +99,11 @@ def replays(
     return jax.vmap(functools.partial(replay, env, candidates, point, states=states))(rollouts, keys)
 
 
-def likelihood(env: Env, candidates: Candidates, rollouts: Rollout, *, states: int = 8) -> Likelihood:
-    """Of rollouts [k] together, for many candidates."""
-
-    def of_one(point: Array, key: Key) -> Array:
-        return replays(env, candidates, point, rollouts, key, states=states).log_likelihood.sum()
-
-    return jax.vmap(of_one)
+def _systematic(key: Key, log_weights: Array) -> Array:
+    """[n] indices, each as often as its weight [n] says, up to one."""
+    n = len(log_weights)
+    ends = jnp.cumsum(jax.nn.softmax(log_weights))
+    return jnp.clip(jnp.searchsorted(ends, (jnp.arange(n) + jax.random.uniform(key)) / n), 0, n - 1)
 
 
 def _jolted(state: EnvState, key: Key) -> EnvState:

@@ -20,7 +20,7 @@ from sgft_jax.learners import sac
 from sgft_jax.math import optim
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig, network_of
-from sgft_jax.models.distortion import Identified, Interface, command_interface
+from sgft_jax.models.distortion import Interface, Seen, command_interface, translated
 from sgft_jax.models.networks import fix_first_layer, make_dynamics
 from sgft_jax.policies import sac_policy
 from sgft_jax.train import options as rules
@@ -58,7 +58,7 @@ class FinetuneState(NamedTuple):
     frozen: PyTree
     transform: PyTree
     replay: PyTree
-    interface: Identified | None = None
+    interface: Any = None
 
 
 Update = Callable[[FinetuneState, Key], tuple[FinetuneState, Metrics]]
@@ -122,7 +122,8 @@ def assemble(parts: Parts, options: LoopOptions, task: Task) -> Finetuner:
         learner, frozen = parts.start(params, key_learner)
         models = None if parts.models is None else parts.models.start(params)
         empty = parts.memory.init(replay.blank(task.obs_dim, task.act_dim), options.replay_capacity)
-        interface = None if parts.interface is None else parts.interface.start(params)
+        key_interface = jax.random.fold_in(key, 1)
+        interface = None if parts.interface is None else parts.interface.start(params, key_interface)
         state = FinetuneState(learner, models, frozen, parts.transform.init(params, key_transform), empty, interface)
         # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
         return jax.tree.map(jnp.copy, state)
@@ -130,17 +131,18 @@ def assemble(parts: Parts, options: LoopOptions, task: Task) -> Finetuner:
     def prepare(state: FinetuneState, simulated: SimulatedData | None) -> FinetuneState:
         if simulated is None:
             return state
-        if parts.interface is not None and state.interface is not None:
+        if parts.interface is not None:
             state = state._replace(interface=parts.interface.prepare(state.interface, simulated))
         return parts.prepare(state, simulated)
 
     def observe(state: FinetuneState, rows: Transition, valid: Array, score: Array | None) -> FinetuneState:
-        del score  # rewards are what is learned from
         state = parts.observed(state._replace(replay=parts.memory.add_episode(state.replay, rows, valid)))
-        if parts.interface is None or state.interface is None:
+        if parts.interface is None:
             return state
         held = jnp.arange(options.replay_capacity) < state.replay.size
-        return state._replace(interface=parts.interface.refit(state.interface, state.replay.data, held))
+        rollout = None if score is None else (rows, valid, score > 0.5)
+        seen = Seen(state.replay.data, held, rollout)
+        return state._replace(interface=parts.interface.refit(state.interface, seen))
 
     def act(
         state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
@@ -202,13 +204,14 @@ def _update(
     """One batch: models learn from its real rows, transforms and the learner from all."""
     keys = jax.random.split(key, 6)
     rows = source.sample((state.replay, simulated), keys[0])
-    if parts.interface is not None and state.interface is not None:
-        rows = parts.interface.meant(state.interface, rows)
     metrics: Metrics = {}
+    if parts.interface is not None:
+        rows = translated(state.interface.distortion, rows)
+        metrics = parts.interface.report(state.interface)
     if parts.models is not None and source.n_real:
         real = jax.tree.map(lambda x: x[: source.n_real], rows)
-        fit, metrics = parts.models.update(state.models, state.frozen.normalizer, real, keys[1])
-        state = state._replace(models=fit)
+        fit, of_models = parts.models.update(state.models, state.frozen.normalizer, real, keys[1])
+        state, metrics = state._replace(models=fit), metrics | of_models
     transform, of_transform = parts.transform.update(state.transform, rows, keys[2])
     batch = parts.transform.apply(transform, parts.imagine(state, keys[3]), rows, keys[4])
     learner, of_learner = parts.learner.update(state.learner, batch, keys[5])

@@ -1,5 +1,7 @@
 """Gaps from names, files, dicts and overrides."""
 
+import pathlib
+
 import jax
 import numpy as np
 import pytest
@@ -187,3 +189,13 @@ def test_a_drift_of_sensors_is_a_table_of_entries(tmp_path):
     ):
         with pytest.raises(UserError, match=words):
             gaps.from_dict(ENV, "g", {"drift": table})
+
+
+GAPS = sorted((pathlib.Path(envs.__file__).parent / "gaps").rglob("*.toml"))
+
+
+@pytest.mark.parametrize("path", [path for path in GAPS if path.parent.name != "distributions"], ids=lambda p: p.stem)
+def test_every_gap_that_comes_with_the_code_can_be_loaded(path):
+    env = envs.make(max((task for task in envs.TASKS if path.stem.startswith(task)), key=len), "c")
+    for source in gaps.each([str(path)]):
+        gaps.load(env, source)

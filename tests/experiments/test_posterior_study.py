@@ -5,22 +5,36 @@ import json
 import numpy as np
 import pytest
 
+import envs
 from experiments.studies import posterior
+from sgft_jax.io.priors import load_prior, save_prior
+from sgft_jax.posterior import decision, interface
+from sgft_jax.posterior.estimator import shaped
+from sgft_jax.types import Prior
 
 
 @pytest.mark.slow
-def test_both_parts_on_push(tmp_path, monkeypatch, capsys):
-    sizes = {"_CANDIDATES": 3, "_JUDGES": 2, "_EPISODES": 1, "_PLAYED": 2, "EXPONENTS": (0.001, 0.002)}
+def test_all_parts_on_push(tmp_path, monkeypatch, capsys):
+    for module in (posterior, decision, interface):
+        for name, value in {"CANDIDATES": 2, "JUDGES": 2}.items():
+            monkeypatch.setattr(module, name, value)
+    sizes = {"_PLAYED": 2, "_POINTS": 8, "_DECIDED": 1, "_GAPS": 2, "_LOOKED": 2, "_EVALUATED": 2, "_RUNS": 1}
     for name, value in sizes.items():
         monkeypatch.setattr(posterior, name, value)
+    env, prior = envs.make("push", "c"), load_prior("shipped:push/seed-0")
+    entry = interface.entry_of(env)
+    unlearned = shaped(entry["steps"], entry["measured"], env.act_dim, len(entry["unknowns"]))
+    known = Prior(prior.params._replace(estimator=unlearned), {**prior.card, "estimator": entry})
+    save_prior(tmp_path / "priors/push/seed-0", known)
     args = posterior.PosteriorArgs(
-        parts=("gate", "calibrate"),
+        parts=("gate", "calibrate", "deploy"),
         tasks=("push",),
         systems=2,
         rollouts=(1,),
         draws=20,
-        particles=8,
         states=4,
+        gaps=("envs/gaps/push.toml",),
+        priors=tmp_path / "priors",
         impl="c",
         json=True,
         out=tmp_path,
@@ -28,12 +42,13 @@ def test_both_parts_on_push(tmp_path, monkeypatch, capsys):
     posterior.main(args)
     summary = json.loads((tmp_path / "posterior/summary.json").read_text())
     assert json.loads(capsys.readouterr().out) == summary
-    (gate,), lines = summary["gate"], summary["calibrate"]
+    (gate,) = summary["gate"]
     assert gate["least beaten"] >= 0.9 and gate["passed"], "the truth explains its rollouts best"
-    assert [line["exponent"] for line in lines] == [0.0, 0.001, 0.002]
-    assert lines[0]["ancestors"] == 8 and lines[0]["stages"] == 0 < lines[-1]["stages"]
-    numbers = [value for line in lines for value in line.values() if isinstance(value, float)]
-    assert np.isfinite(numbers).all() and len(lines[0]["by unknown"]) == 12
+    for lines in (summary["calibrate"], summary["deploy"]):
+        assert [line["rollouts"] for line in lines] == [0, 1]
+        numbers = [value for line in lines for value in line.values() if isinstance(value, float)]
+        assert np.isfinite(numbers).all()
+    assert len(summary["calibrate"][0]["by unknown"]) == 12 and len(summary["deploy"][0]["gaps"]) == 2
 
 
 def test_bad_numbers_are_one_line_and_leave_nothing(tmp_path, capsys):

@@ -168,6 +168,11 @@ def test_the_phases_of_every_command():
         "collect_run": {"compiling the training", "playing the episodes to record"},
         "demo": {"waiting for ..."},
         "diagnose_run": {"playing ... of each prior", "examining the rollouts"},
+        "estimate": {"compiling the simulator and worlds of ..."},
+        "estimating": {
+            "simulating ... rollouts of ... to learn from",
+            "learning which systems of ... make which rollouts",
+        },
         "evaluate": {"building ... worlds for each system", "playing ... episodes for each policy"},
         "export": {"exporting to ... and comparing actions"},
         "finetune_run": {
@@ -190,9 +195,10 @@ def test_the_phases_of_every_command():
             "compiling the simulator and worlds of ...",
             "playing ... rollouts",
             "replaying in ... systems",
-            "replaying in the systems of the prior",
-            "sampling the posterior with exponent ...",
             "playing in particles what may be deployed",
+            "compiling ... real systems of ...",
+            "playing the policy as it is",
+            "playing, and choosing what to deploy",
         },
         "pretrain_run": {
             "building ... worlds",

@@ -1,0 +1,177 @@
+"""A network that reads rollouts and says which systems may have made them: a posterior learned in simulation. Pure.
+
+The simulator makes as many (system, rollouts) pairs as one likes, so the network is trained to give the true system of
+each the highest density: neural posterior estimation (Papamakarios and Murray 2016; in robotics BayesSim, Ramos et al.
+2019). What is chaotic in contacts, and where objects really were, is averaged over by training.
+
+Each number of a system, in the unit interval, has a histogram that depends on the rollouts and on the numbers before
+it. So a density may have any shape within the cube, is exact, and can be drawn from.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from envs.types import Array, Key, PyTree
+from sgft_jax.posterior.replay import Rollout
+
+_WIDTH, _HEADS, _STEPS, _ROLLOUTS = 128, 4, 3, 2  # of the encoder: units, heads, layers over steps and over rollouts
+_BINS, _HIDDEN = 64, 256  # of a histogram, and units of the network that fills it
+_WAVES = 6  # pairs of sine and cosine by which a number is read
+_SCALE = 4.0  # std of a measurement within which its waves tell places apart
+_MANY = 4.0  # rollouts, for scale
+_FARTHEST = 10.0  # std: beyond it a number is cut off
+_LEAST = 1e-4  # raw units: std of a measurement
+
+
+class Statistics(NamedTuple):
+    """mean, std: [measured_dim] of measurements. change: [measured_dim] std of what a step changes."""
+
+    mean: Array
+    std: Array
+    change: Array
+
+
+class Estimator(NamedTuple):
+    """What a trained network needs: its params and the statistics of what it reads."""
+
+    params: PyTree
+    statistics: Statistics
+
+
+class _Block(nn.Module):
+    """A layer of a transformer over [n, width], of which [n] bool count."""
+
+    @nn.compact
+    def __call__(self, x: Array, counts: Array) -> Array:
+        attention = nn.MultiHeadDotProductAttention(_HEADS)
+        read = nn.LayerNorm()(x)
+        x = x + attention(read, mask=jnp.broadcast_to(counts, (1, len(x), len(x))))
+        hidden = nn.gelu(nn.Dense(2 * x.shape[-1])(nn.LayerNorm()(x)))
+        return x + nn.Dense(x.shape[-1])(hidden)
+
+
+class _Encoder(nn.Module):
+    """Tokens of rollouts [k, T, f], valid [k, T], success [k], counts [k] -> [2 * width + 1] what they say."""
+
+    @nn.compact
+    def __call__(self, tokens: Array, valid: Array, success: Array, counts: Array) -> Array:
+        steps = tokens.shape[1]
+        x = nn.Dense(_WIDTH)(tokens) + self.param("time", nn.initializers.normal(0.1), (1, steps, _WIDTH))
+        for _ in range(_STEPS):
+            x = nn.vmap(_Block, variable_axes={"params": None}, split_rngs={"params": False})()(x, valid)
+        mean = jnp.sum(x * valid[..., None], axis=1) / jnp.maximum(valid.sum(1), 1)[:, None]
+        most = jnp.max(jnp.where(valid[..., None], x, -1e3), axis=1)
+        summary = jnp.concatenate([mean, most, success[:, None]], axis=1)
+        y = nn.Dense(_WIDTH)(nn.gelu(nn.Dense(2 * _WIDTH)(summary)))
+        for _ in range(_ROLLOUTS):
+            y = _Block()(y, counts)
+        total = jnp.sum(y * counts[:, None], axis=0)
+        n = jnp.maximum(counts.sum(), 1)
+        return jnp.concatenate([total / n, total / _MANY, jnp.log(n)[None]])
+
+
+class _Head(nn.Module):
+    """(context, numbers before this one [d], the others 0, which number it is [d]) -> [bins] logits."""
+
+    @nn.compact
+    def __call__(self, context: Array, before: Array, which: Array) -> Array:
+        x = jnp.concatenate([context, _waves(before), which])
+        for _ in range(2):
+            x = nn.gelu(nn.LayerNorm()(nn.Dense(_HIDDEN)(x)))
+        return nn.Dense(_BINS)(x)
+
+
+def shaped(steps: int, measured: int, act_dim: int, d: int) -> Estimator:
+    """Zeros of the shapes that an estimator has for rollouts of so many steps, measurements and actions."""
+    rollout = Rollout(
+        jnp.zeros((1, 1, steps + 1, measured)),
+        jnp.zeros((1, 1, steps, act_dim)),
+        jnp.ones((1, 1, steps), bool),
+        jnp.zeros((1, 1), bool),
+    )
+    shapes = jax.eval_shape(lambda: init(jax.random.key(0), rollout, d))
+    return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+
+def init(key: Key, rollouts: Rollout, d: int) -> Estimator:
+    """A fresh estimator of systems with d unknowns. rollouts: [n, k], which say in what range measurements are."""
+    key_encoder, key_head = jax.random.split(key)
+    statistics = _statistics(rollouts)
+    inputs = _read(statistics, jax.tree.map(lambda x: x[0], rollouts), jnp.ones(rollouts.success.shape[1], bool))
+    encoder = _Encoder().init(key_encoder, *inputs)
+    nothing = jnp.zeros(d)
+    head = _Head().init(key_head, _Encoder().apply(encoder, *inputs), nothing, nothing)
+    return Estimator({"encoder": encoder, "head": head}, statistics)
+
+
+def log_density(estimator: Estimator, rollouts: Rollout, counts: Array, point: Array) -> Array:
+    """[d] nats of each number of a point [d], given those before it. rollouts: [k], of which counts [k] bool count."""
+    d, fill = len(point), _fill(estimator, rollouts, counts)
+    before = jnp.where(jnp.tril(jnp.ones((d, d), bool), -1), point, 0.0)
+    bins = jnp.clip(jnp.floor(point * _BINS).astype(jnp.int32), 0, _BINS - 1)
+    return jax.vmap(fill)(before, jnp.eye(d))[jnp.arange(d), bins]
+
+
+def draw(estimator: Estimator, rollouts: Rollout, counts: Array, d: int, key: Key, n: int) -> Array:
+    """[n, d] independent points of the posterior; arguments as of `log_density`."""
+    fill = _fill(estimator, rollouts, counts)
+
+    def number(point: Array, row: tuple[Array, Key]) -> tuple[Array, None]:
+        which, key = row
+        key_bin, key_share = jax.random.split(key)
+        chosen = jax.random.categorical(key_bin, fill(point, which))
+        return point + which * (chosen + jax.random.uniform(key_share)) / _BINS, None
+
+    def one(key: Key) -> Array:
+        return jax.lax.scan(number, jnp.zeros(d), (jnp.eye(d), jax.random.split(key, d)))[0]
+
+    return jax.vmap(one)(jax.random.split(key, n))
+
+
+def _fill(estimator: Estimator, rollouts: Rollout, counts: Array) -> Callable[[Array, Array], Array]:
+    """What fills histograms: (numbers so far [d], which one is next [d]) -> [bins] nats of its density."""
+    context = _Encoder().apply(estimator.params["encoder"], *_read(estimator.statistics, rollouts, counts))
+
+    def fill(before: Array, which: Array) -> Array:
+        logits = cast(Array, _Head().apply(estimator.params["head"], context, before, which))
+        return jax.nn.log_softmax(logits) + math.log(_BINS)
+
+    return fill
+
+
+def _statistics(rollouts: Rollout) -> Statistics:
+    """Of rollouts [n, k]."""
+    before, after = rollouts.measured[..., :-1, :], rollouts.measured[..., 1:, :]
+    axes, valid = (0, 1, 2), rollouts.valid[..., None]
+    mean, std, change = (
+        after.mean(axes, where=valid),
+        after.std(axes, where=valid),
+        (after - before).std(axes, where=valid),
+    )
+    return Statistics(mean, jnp.maximum(std, _LEAST), jnp.maximum(change, _LEAST))
+
+
+def _read(statistics: Statistics, rollouts: Rollout, counts: Array) -> tuple[Array, Array, Array, Array]:
+    """What the encoder reads of rollouts [k]; the last three of it are theirs."""
+
+    def token(before: Array, after: Array, action: Array, last: Array, valid: Array) -> Array:
+        place = (before - statistics.mean) / statistics.std
+        change = (after - before) / statistics.change
+        numbers = jnp.concatenate([place, _waves(place / _SCALE), change, action, last])
+        return jnp.where(valid, jnp.clip(numbers, -_FARTHEST, _FARTHEST), 0.0)
+
+    action, measured = rollouts.action, rollouts.measured
+    last = jnp.concatenate([jnp.zeros_like(action[:, :1]), action[:, :-1]], axis=1)
+    tokens = jax.vmap(jax.vmap(token))(measured[:, :-1], measured[:, 1:], action, last, rollouts.valid)
+    return tokens, rollouts.valid, rollouts.success.astype(jnp.float32), counts
+
+
+def _waves(x: Array) -> Array:
+    """Numbers [k] with their sines and cosines, [(2 * waves + 1) * k]."""
+    angles = jnp.pi * jnp.outer(2.0 ** jnp.arange(_WAVES), x)
+    return jnp.concatenate([x[None], jnp.sin(angles), jnp.cos(angles)]).ravel()

@@ -1,0 +1,79 @@
+"""How fine-tuning uses the posterior: every rollout says anew behind which correction the policy acts. Pure.
+
+The candidates play in the simulator what the simulator's policy would do there; see `decision`.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env
+from envs.types import Array, Key, Policy, PyTree, UserError
+from sgft_jax.models.distortion import Distortion, Interface, Seen, none
+from sgft_jax.posterior.candidates import Candidates, unknowns_of
+from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
+from sgft_jax.posterior.estimator import Estimator, draw
+from sgft_jax.posterior.learning import MOST
+from sgft_jax.posterior.replay import Rollout, rollout_of
+
+
+class Believed(NamedTuple):
+    """What is known of one real system.
+
+    params: of the policy that plays in simulation, without an estimator. rollouts: [MOST] the last ones, and `count` []
+    how many there have been. distortion: what undoes the system's errors, as chosen. promised: [] the success that is
+    expected of the policy behind it, nan before any rollout. key: of the next choice.
+    """
+
+    params: PyTree
+    estimator: Estimator
+    rollouts: Rollout
+    count: Array
+    distortion: Distortion
+    promised: Array
+    key: Key
+
+
+def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interface:
+    """Identification by the estimator of a prior. env: the task in the simulator, as the policy observes it.
+
+    Raises UserError for a task that is not judged by success.
+    """
+    if env.score != "success":
+        raise UserError(f"the posterior promises success, and {env.name} is judged by its return; take another method")
+    nothing, steps = none(env.act_dim, env.measured_dim), env.episode_length
+    blank = Rollout(
+        jnp.zeros((MOST, steps + 1, env.measured_dim)),
+        jnp.zeros((MOST, steps, env.act_dim)),
+        jnp.zeros((MOST, steps), bool),
+        jnp.zeros(MOST, bool),
+    )
+
+    def start(params: PyTree, key: Key) -> Believed:
+        if params.estimator is None:
+            raise UserError("this prior has no estimator of systems; `python -m experiments.estimate` makes it")
+        acting = params._replace(estimator=None, critic=None, value=None, dynamics=None)
+        return Believed(acting, params.estimator, blank, jnp.int32(0), nothing, jnp.float32(jnp.nan), key)
+
+    def refit(known: Believed, seen: Seen) -> Believed:
+        if seen.rollout is None:  # of a log, which does not tell success
+            return known
+        key, key_points, key_choice = jax.random.split(known.key, 3)
+        last, place = rollout_of(env, *seen.rollout), known.count % MOST
+        rollouts = jax.tree.map(lambda rows, row: rows.at[place].set(row), known.rollouts, last)
+        counts = jnp.arange(MOST) <= known.count
+        points = draw(known.estimator, rollouts, counts, len(systems.unknowns), key_points, CANDIDATES + JUDGES)
+        distortion, promised = choose(env, systems, policy, known.params, points, key_choice)
+        return Believed(known.params, known.estimator, rollouts, known.count + 1, distortion, promised, key)
+
+    def report(known: Believed) -> dict[str, Array]:
+        return {"posterior/promised": known.promised}
+
+    return Interface(start, lambda known, simulated: known, refit, report)
+
+
+def entry_of(env: Env) -> dict[str, Any]:
+    """What the card of a prior says of an estimator for a task."""
+    unknowns = [unknown._asdict() for unknown in unknowns_of(env)]
+    return {"unknowns": unknowns, "steps": env.episode_length, "measured": env.measured_dim}

@@ -1,0 +1,96 @@
+"""How the estimator learns: from rollouts of simulated systems that are known. Pure."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env
+from envs.types import Array, Key, Policy, PyTree
+from sgft_jax.math import optim
+from sgft_jax.models.distortion import none
+from sgft_jax.posterior.candidates import Candidates
+from sgft_jax.posterior.decision import correction, play
+from sgft_jax.posterior.estimator import Estimator, Statistics, init, log_density
+from sgft_jax.posterior.replay import Rollout, rollout_of
+
+MOST = 10  # rollouts that are read together
+TOGETHER = (1, 2, 4, MOST)  # how many an update reads; each number in its turn
+_BATCH = 1024  # rollouts of an update
+_RATE, _WARMUP, _GRADIENT = 5e-4, 500, 1.0  # Adam's, the updates until it is reached, and the largest norm
+_PLAIN, _NEAR = 0.5, 0.35  # shares of rollouts without a correction, and with one that is nearly right
+_NEARLY, _WRONG = 0.12, 0.5  # std of what corrections miss, in units of the cube
+_EXPLORES = 0.5  # share of rollouts that explore, as training rollouts do
+
+_OPTIMISER = optim.adam(_GRADIENT)
+
+
+class Lessons(NamedTuple):
+    """points: [n, d] systems. rollouts: [n, MOST] in each."""
+
+    points: Array
+    rollouts: Rollout
+
+
+class Learning(NamedTuple):
+    """An estimator that learns."""
+
+    fit: optim.Fit
+    statistics: Statistics
+
+    @property
+    def estimator(self) -> Estimator:
+        """As it is now."""
+        return Estimator(self.fit.params, self.statistics)
+
+
+def simulate(env: Env, systems: Candidates, policy: Policy, params: PyTree, key: Key, n: int) -> Lessons:
+    """Rollouts in n systems of the prior, by the policy behind corrections as they may be deployed: none, one that is
+    nearly right, or one that is wrong.
+    """
+    key_points, key_play = jax.random.split(key)
+    points = systems.draw(key_points, n)
+
+    def record(point: Array, key: Key) -> Rollout:
+        key_kind, key_miss, key_explore, key_world, key_episode = jax.random.split(key, 5)
+        kind = jax.random.uniform(key_kind)
+        std = jnp.where(kind < _PLAIN + _NEAR, _NEARLY, _WRONG)
+        near = jnp.clip(point + std * jax.random.normal(key_miss, point.shape), 0.0, 1.0)
+        plain, undo = none(env.act_dim, env.measured_dim), correction(env, systems.unknowns, near)
+        deployed = params._replace(distortion=jax.tree.map(lambda a, b: jnp.where(kind < _PLAIN, a, b), plain, undo))
+        explore = jax.random.bernoulli(key_explore, _EXPLORES)
+        episode = play(env, policy, deployed, systems.episode(point, key_world), key_episode, explore=explore)
+        return rollout_of(env, episode.transitions, episode.valid, episode.success)
+
+    keys = jax.random.split(key_play, (n, MOST))
+    return Lessons(points, jax.vmap(jax.vmap(record, (None, 0)))(points, keys))
+
+
+def begin(key: Key, lessons: Lessons) -> Learning:
+    """Before the first update."""
+    fresh = init(key, lessons.rollouts, lessons.points.shape[1])
+    return Learning(optim.start(_OPTIMISER, fresh.params), fresh.statistics)
+
+
+def learn(learning: Learning, lessons: Lessons, key: Key, *, together: int, updates: int, total: int) -> Learning:
+    """After `updates` more that read so many rollouts together, of `total` for each number of `TOGETHER`."""
+    size, whole = max(1, _BATCH // together), total * len(TOGETHER)
+    counts = jnp.ones(together, bool)
+
+    def update(learning: Learning, key: Key) -> tuple[Learning, None]:
+        key_systems, key_rollouts = jax.random.split(key)
+        systems = jax.random.randint(key_systems, (size,), 0, len(lessons.points))
+        keys = jax.random.split(key_rollouts, size)
+        which = jax.vmap(lambda key: jax.random.permutation(key, MOST)[:together])(keys)
+        rollouts = jax.tree.map(lambda x: x[systems[:, None], which], lessons.rollouts)
+        step = optim.steps_of(learning.fit)
+        rate = _RATE * optim.warmup_factor(step, min(_WARMUP, whole / 10)) * optim.cosine_factor(step, whole)
+
+        def loss(params: PyTree) -> tuple[Array, None]:
+            estimator = Estimator(params, learning.statistics)
+            nats = jax.vmap(lambda *x: log_density(estimator, x[0], counts, x[1]))(rollouts, lessons.points[systems])
+            return -nats.sum(axis=1).mean(), None
+
+        return learning._replace(fit=optim.minimise(_OPTIMISER, loss, learning.fit, rate)[0]), None
+
+    return jax.lax.scan(update, learning, jax.random.split(key, updates))[0]

@@ -1,0 +1,61 @@
+"""Priors are given an estimator, and fine-tuning reads it."""
+
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import estimate, finetune
+from experiments.runner import cli
+from sgft_jax.io.cards import SHIPPED
+from sgft_jax.io.priors import load_prior
+from sgft_jax.posterior import decision, interface
+
+
+@pytest.fixture
+def prior(tmp_path):
+    return shutil.copytree(SHIPPED / "push/seed-0", tmp_path / "prior/seed-0")
+
+
+@pytest.mark.slow
+def test_a_prior_is_given_an_estimator_and_adapts(prior, tmp_path, monkeypatch, capsys):
+    for module in (decision, interface):
+        for name, value in {"CANDIDATES": 2, "JUDGES": 2}.items():
+            monkeypatch.setattr(module, name, value)
+    before = load_prior(prior)
+    estimate.main(estimate.EstimateArgs(prior=prior, lessons=4, updates=1, impl="c"))
+    assert "after 10 rollouts it is" in capsys.readouterr().out
+    after = load_prior(prior)
+    assert jax.tree.all(jax.tree.map(np.array_equal, after.params._replace(estimator=None), before.params))
+    options = ["--task", "push", "--method", "posterior", "--prior", str(prior), "--rollouts", "2", "--no-video"]
+    finetune.main([*options, "--seeds", "1", "--eval-episodes", "2", "--impl", "c", "--out", str(tmp_path / "runs")])
+    (summary,) = (tmp_path / "runs").rglob("summary.json")
+    assert json.loads(summary.read_text())
+    (policy,) = (tmp_path / "runs").glob("finetune/push/*/posterior/*/policy/seed-*")
+    tuned = load_prior(policy)
+    assert tuned.params.estimator is None and tuned.params.distortion is not None
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--prior", "shipped:push"], "comes with the code"),
+        (["--prior", "shipped:push", "--lessons", "0"], "--lessons is 0"),
+        (["--prior", "nowhere"], "no such folder"),
+    ],
+)
+def test_what_cannot_be_is_one_line(words, expected, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.run_main(estimate.main, estimate.EstimateArgs, "", argv=words)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and expected in error and error.count("\n") == 1
+
+
+def test_finetuning_says_how_an_estimator_is_made(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        finetune.main(
+            ["--task", "insert", "--method", "posterior", "--prior", "shipped:insert-cpu", "--out", str(tmp_path)]
+        )
+    assert stopped.value.code == 2 and "experiments.estimate" in capsys.readouterr().err

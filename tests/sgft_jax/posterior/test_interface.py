@@ -1,0 +1,114 @@
+"""Fine-tuning by the posterior: every rollout is told, and the policy acts behind what is chosen."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy
+
+from envs import gaps
+from envs.rollout import real_worlds
+from sgft_jax.data.replay import blank
+from sgft_jax.files.disk import jsonable
+from sgft_jax.io.priors import load_prior, save_prior
+from sgft_jax.learners.sac import SACParams
+from sgft_jax.methods import get_method
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.models.networks import make_actor
+from sgft_jax.posterior import estimator
+from sgft_jax.posterior.interface import entry_of
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.train import finetuning
+from sgft_jax.types import Normalizer, Prior, UserError
+
+TOY = toy.make()
+NET = NetworkConfig(hidden=(8,))
+
+
+@functools.cache
+def small_estimator():
+    """One that has learned nothing."""
+    entry = entry_of(TOY)
+    zeros = estimator.shaped(entry["steps"], entry["measured"], 2, len(entry["unknowns"]))
+    keys = iter(jax.random.split(jax.random.key(0), len(jax.tree.leaves(zeros))))
+    return jax.tree.map(lambda x: 0.1 * jax.random.normal(next(keys), x.shape), zeros)._replace(
+        statistics=estimator.Statistics(jnp.zeros(4), jnp.ones(4), jnp.ones(4))
+    )
+
+
+@functools.cache
+def prior(known=True):
+    actor = make_actor(4, 2, NET).init(jax.random.key(1))
+    still = Normalizer(jnp.zeros(4), jnp.ones(4))
+    params = SACParams(actor, None, None, None, still, estimator=small_estimator() if known else None)
+    card = {"task": "toy", "obs_dim": 4, "act_dim": 2, "gamma": 0.9, "algorithm": "sac", "network": jsonable(NET)}
+    return Prior(params, card | ({"estimator": entry_of(TOY)} if known else {}))
+
+
+def build(known=True, task=TOY, card=None, **options):
+    method = get_method("posterior")
+    start = prior(known)
+    return method.build(method.config(**options), Prior(start.params, card or start.card), task)
+
+
+def real(**effects):
+    gap = gaps.from_dict(TOY, "real", {"effects": effects})
+    return Simulated(TOY, real_worlds(TOY, [gap], jax.random.key(0)), jnp.zeros(2, int), gamma=0.9)
+
+
+@pytest.mark.heavy
+def test_every_rollout_is_remembered_and_chooses_anew():
+    fine, seeds = build(guard=False), jnp.array([0, 1], jnp.uint32)
+    start = jax.tree.map(lambda x: x[None], prior().params)
+    states = list(finetuning.finetune(fine, real(action_scale=0.7), start, seeds, rollouts=3))
+    progress, metrics = states[-1]
+    known = progress.agent.interface
+    assert (
+        known.count.tolist() == [3, 3] and known.rollouts.valid[:, :3].all() and not known.rollouts.valid[:, 3:].any()
+    )
+    assert ((metrics["posterior/promised"] >= 0) & (metrics["posterior/promised"] <= 1)).all()
+    exported = jax.vmap(fine.export)(progress.agent)
+    assert exported.estimator is None and jax.tree.map(jnp.array_equal, exported.distortion, known.distortion)
+    np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"][0], prior().params.actor["Dense_0"]["kernel"])
+
+
+def test_a_log_without_success_chooses_nothing():
+    fine = build(guard=False)
+    state = fine.init(prior().params, jax.random.key(0))
+    rows = jax.tree.map(lambda x: jnp.zeros((20, *x.shape), x.dtype), blank(4, 2))
+    after = fine.observe(state, rows, jnp.ones(20, bool), None)
+    assert after.interface.count == 0 and jnp.isnan(after.interface.promised)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"known": False}, "no estimator; `python -m experiments.estimate"),
+        ({"task": TOY._replace(score="return")}, "judged by its return"),
+        ({"task": TOY._replace(restore=None)}, "no simulator"),
+        ({"task": TOY._replace(episode_length=21)}, "knows other systems than toy"),
+        ({"task": TOY._replace(parameters=TOY.parameters[:1])}, "knows other systems than toy"),
+    ],
+)
+def test_what_cannot_be_is_one_line(options, words):
+    with pytest.raises(UserError, match=words):
+        build(**options)
+
+
+def test_a_prior_keeps_its_estimator_on_disk(tmp_path):
+    folder = save_prior(tmp_path / "prior", prior())
+    again = load_prior(folder)
+    assert again.card["estimator"] == entry_of(TOY)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, again.params.estimator, prior().params.estimator))
+
+
+def test_an_estimator_that_the_card_does_not_describe_is_refused(tmp_path):
+    for card, words in (
+        ({"estimator": None}, "of which its card says nothing"),
+        ({"estimator": entry_of(TOY) | {"steps": 7}}, "estimator"),
+    ):
+        folder = save_prior(tmp_path / words[:4], Prior(prior().params, prior().card | card))
+        with pytest.raises(UserError, match=words):
+            load_prior(folder)
