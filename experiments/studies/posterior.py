@@ -226,7 +226,7 @@ def _judged(
         deployed, promised = choose(setup.env, setup.systems, setup.policy, setup.behind(None), points, key_choose)
         both, keys = stack([setup.nothing(), deployed]), jax.random.split(key_played, _PLAYED)
         played = jax.vmap(jax.vmap(setup.success, (None, None, 0)), (0, None, None))(both, true, keys).mean(axis=1)
-        return promised, played[0], played[1]
+        return promised[1], played[0], played[1]
 
     few = points[:, -CANDIDATES - JUDGES :]
     first = jax.tree.map(lambda x: x[:_DECIDED], (true, few, keys[1]))
@@ -332,7 +332,8 @@ def _adapted(
         key_points, key_decide = jax.random.split(row[1])
         points = _points(setup, estimator, row[0], jnp.arange(MOST) < number, key_points)
         few = points[-CANDIDATES - JUDGES :]
-        return choose(setup.env, setup.systems, setup.policy, setup.behind(None), few, key_decide)
+        deployed, promised = choose(setup.env, setup.systems, setup.policy, setup.behind(None), few, key_decide)
+        return deployed, promised[1]
 
     chosen, promised = jax.lax.map(decide, (rollouts, keys_choose), batch_size=_AT_ONCE)
     played = _success(setup, real, chosen, runs.which, key_evaluate, episodes=_EVALUATED)

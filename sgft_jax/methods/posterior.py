@@ -1,7 +1,7 @@
 """The prior behind the correction that most systems call for which may have made the real rollouts; nothing learns.
 
-The prior's estimator says which systems these are, and simulated episodes in them say what to deploy
-(`sgft_jax/posterior`).
+The prior's estimator says which systems these are, simulated episodes in them what could be deployed, and real rollouts
+how far to trust them (`sgft_jax/posterior`).
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,6 @@ class Config(checks.Checked):
 
     initial_rollouts: checks.Count = 1
     """Real rollouts before the first choice."""
-    guard: bool = True
-    """Deploy a choice only while its real rollouts say that it is better than the prior as it is, or than the best
-    choice since (sgft_jax/train/guard.py)."""
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
@@ -52,7 +49,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     parts = unlearned(policy, start, export)
     parts = parts._replace(interface=posterior_interface(task, candidates(task), policy))
-    loop = LoopOptions(initial_rollouts=config.initial_rollouts, guard=config.guard)
+    loop = LoopOptions(initial_rollouts=config.initial_rollouts)
     return assemble(parts, loop, task)._replace(updates_per_rollout=1)
 
 

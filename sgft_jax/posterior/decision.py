@@ -63,8 +63,8 @@ def play(env: Env, policy: Policy, params: PyTree, world: World, key: Key, *, ex
 def choose(
     env: Env, candidates: Candidates, policy: Policy, params: PyTree, points: Array, key: Key
 ) -> tuple[Distortion, Array]:
-    """Behind which correction to deploy a policy, and what success [] to expect, by points [CANDIDATES + JUDGES, d] of
-    a posterior. params: what the policy acts by, with a distortion that is replaced.
+    """Behind which correction to deploy a policy, and the success [2] to expect of it as it is and behind that, by
+    points [CANDIDATES + JUDGES, d] of a posterior. params: what the policy acts by, with a distortion that is replaced.
     """
     undo = jax.vmap(lambda point: correction(env, candidates.unknowns, point))(points[:CANDIDATES])
     acting = join([stack([none(env.act_dim, env.measured_dim)]), undo])
@@ -73,7 +73,7 @@ def choose(
         return play(env, policy, params._replace(distortion=distortion), world, key).success
 
     decision = decide(success, acting, candidates, points[CANDIDATES:], key, episodes=_EPISODES)
-    return member(acting, decision.chosen), decision.promised
+    return member(acting, decision.chosen), jnp.stack([decision.expected[0], decision.promised])
 
 
 def decide(

@@ -1,6 +1,7 @@
 """How fine-tuning uses the posterior: every rollout says anew behind which correction the policy acts. Pure.
 
-The candidates play in the simulator what the simulator's policy would do there; see `decision`.
+The candidates play in the simulator what the prior's policy would do there, see `decision`; real rollouts say how far
+to trust what they promise, see `trust`.
 """
 
 from typing import Any, NamedTuple
@@ -16,20 +17,25 @@ from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
 from sgft_jax.posterior.estimator import Estimator, draw
 from sgft_jax.posterior.learning import MOST
 from sgft_jax.posterior.replay import Rollout, rollout_of
+from sgft_jax.posterior.trust import Trust, begin, deploys, expected, told
 
 
 class Believed(NamedTuple):
     """What is known of one real system.
 
     params: of the policy that plays in simulation, without an estimator. rollouts: [MOST] the last ones, and `count` []
-    how many there have been. distortion: what undoes the system's errors, as chosen. promised: [] the success that is
-    expected of the policy behind it, nan before any rollout. key: of the next choice.
+    how many there have been. trust: in simulation. deployed: [] bool, whether that is deployed which is chosen by
+    simulation, instead of the prior as it is. distortion: what it corrects then, else nothing. promised: [2] the
+    success that simulation promises for the prior and for what is chosen, nan before any rollout. key: of the next
+    choice.
     """
 
     params: PyTree
     estimator: Estimator
     rollouts: Rollout
     count: Array
+    trust: Trust
+    deployed: Array
     distortion: Distortion
     promised: Array
     key: Key
@@ -54,7 +60,8 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interf
         if params.estimator is None:
             raise UserError("this prior has no estimator of systems; `python -m experiments.estimate` makes it")
         acting = params._replace(estimator=None, critic=None, value=None, dynamics=None)
-        return Believed(acting, params.estimator, blank, jnp.int32(0), nothing, jnp.float32(jnp.nan), key)
+        nan, no = jnp.full(2, jnp.nan), jnp.zeros((), bool)
+        return Believed(acting, params.estimator, blank, jnp.int32(0), begin(), no, nothing, nan, key)
 
     def refit(known: Believed, seen: Seen) -> Believed:
         if seen.rollout is None:  # of a log, which does not tell success
@@ -64,11 +71,22 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interf
         rollouts = jax.tree.map(lambda rows, row: rows.at[place].set(row), known.rollouts, last)
         counts = jnp.arange(MOST) <= known.count
         points = draw(known.estimator, rollouts, counts, len(systems.unknowns), key_points, CANDIDATES + JUDGES)
-        distortion, promised = choose(env, systems, policy, known.params, points, key_choice)
-        return Believed(known.params, known.estimator, rollouts, known.count + 1, distortion, promised, key)
+        choice, promised = choose(env, systems, policy, known.params, points, key_choice)
+        trust = told(known.trust, known.deployed, known.promised[known.deployed.astype(jnp.int32)], last.success)
+        deployed = deploys(trust, promised)
+        return known._replace(
+            rollouts=rollouts,
+            count=known.count + 1,
+            trust=trust,
+            deployed=deployed,
+            distortion=jax.tree.map(lambda a, b: jnp.where(deployed, a, b), choice, nothing),
+            promised=promised,
+            key=key,
+        )
 
     def report(known: Believed) -> dict[str, Array]:
-        return {"posterior/promised": known.promised}
+        prior, chosen = expected(known.trust, known.promised)
+        return {"posterior/deployed": known.deployed, "posterior/prior": prior, "posterior/chosen": chosen}
 
     return Interface(start, lambda known, simulated: known, refit, report)
 
