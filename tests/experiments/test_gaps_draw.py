@@ -36,7 +36,7 @@ OPTIONS = """--task toy_steps --preset cpu --seed 5 --episodes 200 --config.n-en
 
 def blindly(network, task):
     """Identification that finds nothing."""
-    return exactly(network, task)._replace(refit=lambda own, rows, held: own)
+    return exactly(network, task)._replace(refit=lambda known, seen: known)
 
 
 def straight(params, carry, obs, key, *, explore):

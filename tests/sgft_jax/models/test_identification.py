@@ -9,7 +9,7 @@ import tuners
 from sgft_jax.io.priors import load_prior, save_prior
 from sgft_jax.models import distortion, dynamics
 from sgft_jax.models.config import network_of
-from sgft_jax.models.distortion import Distortion, command_interface
+from sgft_jax.models.distortion import Distortion, translated
 from sgft_jax.models.networks import make_dynamics
 from sgft_jax.types import Batch, Prior, SimulatedData
 
@@ -76,11 +76,10 @@ def test_it_commands_what_stands_for_the_wish_of_the_actor_and_so_does_what_it_e
 
 
 def test_it_learns_in_the_actions_of_the_simulator(case, learned):
-    part = command_interface(network_of(tuners.prior().card), tuners.TASK)
-    rows = Batch(*steps(case.params, jax.random.key(3), TURN))
-    meant = part.meant(learned.interface, rows)
+    rows, known = Batch(*steps(case.params, jax.random.key(3), TURN)), learned.interface.distortion
+    meant = translated(known, rows)
     np.testing.assert_allclose(meant.action, jax.vmap(TURN.meaning)(rows.action), atol=0.03)
-    mixed = part.meant(learned.interface, rows._replace(is_sim=jnp.arange(N) >= 10))
+    mixed = translated(known, rows._replace(is_sim=jnp.arange(N) >= 10))
     np.testing.assert_array_equal(mixed.action[10:], rows.action[10:])
     np.testing.assert_array_equal(mixed.action[:10], meant.action[:10])
     held = learned.replay.data.action[:N]
