@@ -1,15 +1,14 @@
 """Which system is this? What rollouts tell, on systems that are known (docs/rules.md).
 
-gate: systems are drawn from the prior over what is unknown of a real one, and a shipped prior's policy plays in each;
-the true system and many others replay what it did. calibrate: the posterior of such systems, how often it covers the
-truth, how far it narrows it, and what the policy that is chosen under it promises and does. deploy: the same choice
-after every rollout on drawn development gaps. In both, rollouts 0 is the choice without data.
+calibrate: systems are drawn from the prior over what is unknown of a real one, and a shipped prior's policy plays in
+each; how often the posterior covers the truth, how far it narrows it, and what the policy that is chosen under it
+promises and does. deploy: the same choice after every rollout on drawn development gaps. In both, rollouts 0 is the
+choice without data.
 """
 
 import functools
 import json
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -35,12 +34,10 @@ from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.models.distortion import Distortion, none
 from sgft_jax.posterior.candidates import Candidates, candidates
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, play
-from sgft_jax.posterior.estimator import Estimator, draw
+from sgft_jax.posterior.estimator import Estimator, Rollout, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
-from sgft_jax.posterior.replay import Rollout, replays, rollout_of
-from sgft_jax.stacking import member, stack
+from sgft_jax.stacking import stack
 
-_BEATEN, _SYSTEMS = 0.9, 0.8  # gate 1: the truth beats so many draws, on so many systems
 _POINTS = 256  # of a posterior
 _DECIDED = 32  # systems in which that is deployed which is chosen
 _PLAYED = 50  # episodes of what is chosen, in the true system
@@ -51,25 +48,21 @@ _AT_ONCE = 8  # systems for which a decision is made in one program
 
 @dataclass(frozen=True)
 class PosteriorArgs:
-    """One study of replays."""
+    """One study of posteriors."""
 
-    parts: tuple[Literal["gate", "calibrate", "deploy"], ...] = ("gate",)
+    parts: tuple[Literal["calibrate", "deploy"], ...] = ("calibrate", "deploy")
     """What to measure; the head of this help explains it."""
     tasks: tuple[str, ...] = ("push", "insert", "hammer")
     """Tasks; their shipped priors play."""
     systems: int = 10
-    """Systems a task that are taken for real ones, for gate and calibrate."""
-    rollouts: tuple[int, ...] = (2,)
+    """Systems a task that are taken for real ones, for calibrate."""
+    rollouts: tuple[int, ...] = (1, 4)
     """Rollouts in each of them, one line for each number."""
-    draws: int = 1000
-    """Other systems that replay the same rollouts, for gate."""
     priors: Path | None = None
     """Folder with a prior of each task, TASK/seed-0, that has an estimator; default: those that come with the code."""
     gaps: tuple[str, ...] = ()
     """Real systems for deploy, as files of gaps; default: the drawn ones of development. It takes the four on which
     the policy starts lowest."""
-    states: int = 8
-    """Expert: states of the filter."""
     seed: int = 0
     """Expert: another seed draws other systems."""
     impl: Impl = "auto"
@@ -80,12 +73,10 @@ class PosteriorArgs:
 class Setup(NamedTuple):
     """A task and the policy that plays it.
 
-    env: with the observations of the prior's policy. simulator: without what they hold beside measurements.
-    params: of the policy.
+    env: with the observations of the prior's policy. params: of the policy.
     """
 
     env: Env
-    simulator: Env
     systems: Candidates
     policy: Policy
     params: PyTree
@@ -107,7 +98,7 @@ class Setup(NamedTuple):
 
 def main(args: PosteriorArgs) -> None:
     """Measures, prints and writes the numbers to <out>/posterior/summary.json."""
-    at_least_one(args, "systems", "rollouts", "draws", "states")
+    at_least_one(args, "systems", "rollouts")
     each_once(args, "parts", "tasks", "rollouts")
     seed_list(args.seed, 1)
     if max(args.rollouts) > MOST:
@@ -117,7 +108,7 @@ def main(args: PosteriorArgs) -> None:
     for task in args.tasks:
         setup = _set_up(args, task)
         for part in args.parts:
-            lines = {"gate": _gate, "calibrate": _calibrate, "deploy": _deploy}[part](args, setup)
+            lines = {"calibrate": _calibrate, "deploy": _deploy}[part](args, setup)
             summary[part] += [{"task": task} | line for line in lines]
             folder.mkdir(parents=True, exist_ok=True)
             write_summary(folder, summary)
@@ -134,12 +125,12 @@ def _set_up(args: PosteriorArgs, task: str) -> Setup:
     """The task, its systems and what is played in them."""
     prior = load_prior(f"shipped:{task}/seed-0" if args.priors is None else args.priors / task / "seed-0")
     impl = choose_impl(args.impl)
-    env, simulator = envs.make(task, impl, **observed(prior.card)), envs.make(task, impl)
+    env = envs.make(task, impl, **observed(prior.card))
     policy = make_policy(prior.card, env)
     with doing(f"compiling the simulator and worlds of {task}", 40, once=True):
-        simulator.prepare()
-        systems = candidates(simulator)
-    return Setup(env, simulator, systems, policy, prior.params)
+        env.prepare()
+        systems = candidates(env)
+    return Setup(env, systems, policy, prior.params)
 
 
 def _played(args: PosteriorArgs, setup: Setup, count: int) -> tuple[Array, Rollout]:
@@ -156,45 +147,6 @@ def _played(args: PosteriorArgs, setup: Setup, count: int) -> tuple[Array, Rollo
     with doing(f"playing {args.systems * count} rollouts", 20):
         keys = jax.random.split(key_play, (args.systems, count))
         return true, jax.jit(jax.vmap(jax.vmap(record, (None, 0))))(true, keys)
-
-
-def _gate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
-    """Gate 1 on one task."""
-    key_draws, key_replay = jax.random.split(jax.random.key(args.seed + 1))
-    others = setup.systems.draw(key_draws, args.draws)
-    true, rollouts = _played(args, setup, args.rollouts[0])
-
-    def explain(point: Array, real: Rollout, key: Key) -> tuple[Array, Array]:
-        evidence = replays(setup.simulator, setup.systems, point, real, key, states=args.states)
-        return evidence.log_likelihood.sum(), evidence.success
-
-    replayed = jax.jit(jax.vmap(explain, (0, None, 0)))
-    beaten, right, seconds = [], [], []
-    for number in range(args.systems):
-        real = member(rollouts, number)
-        points = jnp.concatenate([true[number : number + 1], others])
-        keys = jax.random.split(jax.random.fold_in(key_replay, number), len(points))
-        begun = time.perf_counter()
-        with doing(f"replaying in {len(points)} systems", 30, once=True):
-            total, success = jax.device_get(replayed(points, real, keys))
-        seconds.append(time.perf_counter() - begun)
-        beaten.append(float((total[0] > total[1:]).mean()))
-        right.append(float(np.where(real.success, success[0], 1.0 - success[0]).mean()))
-    simulator, passed = setup.simulator, float(np.mean(np.array(beaten) >= _BEATEN))
-    count = (args.draws + 1) * rollouts.success.shape[1] * args.states
-    steps = count * simulator.episode_length * envs.scene(simulator.name).substeps
-    return [
-        {
-            "systems passed": passed,
-            "least beaten": min(beaten),
-            "outcome right": float(np.mean(right)),
-            "success": float(np.mean(rollouts.success)),
-            "first s": seconds[0],
-            "replay s": min(seconds),
-            "steps per s": steps / min(seconds),
-            "passed": passed >= _SYSTEMS,
-        }
-    ]
 
 
 def _calibrate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:

@@ -31,7 +31,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.posterior.interface import entry_of, posterior_interface
     from sgft_jax.train.finetuner import FinetuneState, assemble, unlearned
 
-    if not isinstance(task, Env) or task.restore is None:
+    if not isinstance(task, Env):
         raise UserError("method posterior: this task has no simulator in which systems could be tried; use `sac`")
     card = card_of(prior)
     if not (entry := card.get("estimator")):

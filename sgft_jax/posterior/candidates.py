@@ -19,6 +19,7 @@ from envs.types import Array, Key
 _SCALE, _BIAS, _TURN = (0.35, 1.7), (-0.6, 0.6), (-1.0, 1.0)  # of commands; of their range [-1, 1]; rad
 _LATENCY = 0.6  # control periods at most
 _ERRORS = 2.5  # a constant error is at most so many of an entry's `error`
+_NOISIEST = 2.0  # times training's noise of sensors
 _WIDE = 3.0  # from low to high: from here on a number's logarithm is uniform
 
 
@@ -43,24 +44,26 @@ class Candidates(NamedTuple):
     """Simulated systems of a task, at points [d] of the unit cube.
 
     world(point [d], place [k]) -> World. place: [k] domain parameters that every episode draws anew, within low, high
-    [k] where rollouts are explained, and within the training ranges training_low, training_high [k] in simulation.
+    [k], training's ranges.
     """
 
     unknowns: tuple[Unknown, ...]
     world: Callable[[Array, Array], World]
     low: Array
     high: Array
-    training_low: Array
-    training_high: Array
 
     def draw(self, key: Key, n: int) -> Array:
         """[n, d] points from the prior."""
         return jax.random.uniform(key, (n, len(self.unknowns)))
 
     def episode(self, point: Array, key: Key) -> World:
-        """Where a simulated episode of a candidate takes place."""
-        share = jax.random.uniform(key, self.low.shape)
-        return self.world(point, self.training_low + (self.training_high - self.training_low) * share)
+        """Where a simulated episode of a candidate takes place. Its sensors are up to twice as noisy as training's."""
+        key_place, key_noise = jax.random.split(key)
+        share = jax.random.uniform(key_place, self.low.shape)
+        world = self.world(point, self.low + (self.high - self.low) * share)
+        effects = world.theta.effects.low
+        noise = jax.random.uniform(key_noise, maxval=_NOISIEST) * effects.obs_noise
+        return world._replace(theta=world.theta._replace(effects=exactly(effects._replace(obs_noise=noise))))
 
 
 def values(unknowns: tuple[Unknown, ...], point: Array) -> Array:
@@ -116,11 +119,14 @@ def candidates(env: Env) -> Candidates:
                 effects[unknown.name] = old.at[unknown.index].set(value) if old.ndim else value
             else:
                 params = params.at[names.index(unknown.name)].set(value)
-        exactly = Effects(**effects)
-        return World(Theta(params, EffectRange(exactly, exactly)), model(params))
+        return World(Theta(params, exactly(Effects(**effects))), model(params))
 
-    ends = (*ranges[where].T, *training[where].T)
-    return Candidates(unknowns, world, *(jnp.asarray(end, jnp.float32) for end in ends))
+    return Candidates(unknowns, world, *(jnp.asarray(end, jnp.float32) for end in training[where].T))
+
+
+def exactly(effects: Effects) -> EffectRange:
+    """The range of these effects alone."""
+    return EffectRange(effects, effects)
 
 
 def _noise(env: Env) -> float:

@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from envs.types import Array, Key, PyTree
-from sgft_jax.posterior.replay import Rollout
+from envs.base import Env
+from envs.types import Array, Key, PyTree, Transition
 
 _WIDTH, _HEADS, _STEPS, _ROLLOUTS = 128, 4, 3, 2  # of the encoder: units, heads, layers over steps and over rollouts
 _BINS, _HIDDEN = 64, 256  # of a histogram, and units of the network that fills it
@@ -26,6 +26,19 @@ _SCALE = 4.0  # std of a measurement within which its waves tell places apart
 _MANY = 4.0  # rollouts, for scale
 _FARTHEST = 10.0  # std: beyond it a number is cut off
 _LEAST = 1e-4  # raw units: std of a measurement
+
+
+class Rollout(NamedTuple):
+    """What a real rollout of T steps left.
+
+    measured: [T + 1, measured_dim] at the start and after each step. action: [T, act_dim] as commanded.
+    valid: [T] bool. success: [] bool.
+    """
+
+    measured: Array
+    action: Array
+    valid: Array
+    success: Array
 
 
 class Statistics(NamedTuple):
@@ -84,6 +97,12 @@ class _Head(nn.Module):
         for _ in range(2):
             x = nn.gelu(nn.LayerNorm()(nn.Dense(_HIDDEN)(x)))
         return nn.Dense(_BINS)(x)
+
+
+def rollout_of(env: Env, rows: Transition, valid: Array, success: Array) -> Rollout:
+    """A recorded episode, without what observations hold beside measurements. rows, valid: [T]."""
+    measured = jnp.concatenate([rows.obs[:1], rows.next_obs])[:, : env.measured_dim]
+    return Rollout(measured, rows.action, valid, success)
 
 
 def shaped(steps: int, measured: int, act_dim: int, d: int) -> Estimator:

@@ -14,9 +14,8 @@ from envs.types import Array, Key, Policy, PyTree, UserError
 from sgft_jax.models.distortion import Distortion, Interface, Seen, none
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
-from sgft_jax.posterior.estimator import Estimator, draw
+from sgft_jax.posterior.estimator import Estimator, Rollout, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
-from sgft_jax.posterior.replay import Rollout, rollout_of
 from sgft_jax.posterior.trust import Trust, begin, deploys, expected, told
 
 

@@ -11,8 +11,7 @@ from sgft_jax.math import optim
 from sgft_jax.models.distortion import none
 from sgft_jax.posterior.candidates import Candidates
 from sgft_jax.posterior.decision import correction, play
-from sgft_jax.posterior.estimator import Estimator, Statistics, init, log_density
-from sgft_jax.posterior.replay import Rollout, rollout_of
+from sgft_jax.posterior.estimator import Estimator, Rollout, Statistics, init, log_density, rollout_of
 
 MOST = 10  # rollouts that are read together
 TOGETHER = (1, 2, 4, MOST)  # how many an update reads; each number in its turn

@@ -40,7 +40,7 @@ def where(point, place):
 
 
 NOWHERE = jnp.zeros(0)
-SYSTEMS = Candidates((Unknown("action_bias", 0, 0.0, 1.0),), where, NOWHERE, NOWHERE, NOWHERE, NOWHERE)
+SYSTEMS = Candidates((Unknown("action_bias", 0, 0.0, 1.0),), where, NOWHERE, NOWHERE)
 
 
 def choose(particles, acting=(0.0, 0.3, 0.6), noise=0.0):

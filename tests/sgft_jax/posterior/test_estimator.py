@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from sgft_jax.posterior import estimator, learning
-from sgft_jax.posterior.estimator import Estimator, draw, init, log_density
+from sgft_jax.posterior.estimator import Estimator, Rollout, draw, init, log_density
 from sgft_jax.posterior.learning import MOST, Lessons
-from sgft_jax.posterior.replay import Rollout
 
 STEPS, NOISE = 6, 0.5
 

@@ -89,7 +89,7 @@ def test_a_log_without_success_chooses_nothing():
     [
         ({"known": False}, "no estimator; `python -m experiments.estimate"),
         ({"task": TOY._replace(score="return")}, "judged by its return"),
-        ({"task": TOY._replace(restore=None)}, "no simulator"),
+        ({"task": object()}, "no simulator"),
         ({"task": TOY._replace(episode_length=21)}, "knows other systems than toy"),
         ({"task": TOY._replace(parameters=TOY.parameters[:1])}, "knows other systems than toy"),
     ],
