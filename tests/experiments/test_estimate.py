@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from experiments import estimate, finetune
-from experiments.runner import cli
 from sgft_jax.io.cards import SHIPPED
 from sgft_jax.io.priors import load_prior
 from sgft_jax.posterior import decision, interface
@@ -36,21 +35,6 @@ def test_a_prior_is_given_an_estimator_and_adapts(prior, tmp_path, monkeypatch, 
     (policy,) = (tmp_path / "runs").glob("finetune/push/*/posterior/*/policy/seed-*")
     tuned = load_prior(policy)
     assert tuned.params.estimator is None and tuned.params.distortion is not None
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["--prior", "shipped:push"], "comes with the code"),
-        (["--prior", "shipped:push", "--lessons", "0"], "--lessons is 0"),
-        (["--prior", "nowhere"], "no such folder"),
-    ],
-)
-def test_what_cannot_be_is_one_line(words, expected, capsys):
-    with pytest.raises(SystemExit) as stopped:
-        cli.run_main(estimate.main, estimate.EstimateArgs, "", argv=words)
-    error = capsys.readouterr().err
-    assert stopped.value.code == 2 and expected in error and error.count("\n") == 1
 
 
 def test_finetuning_says_how_an_estimator_is_made(tmp_path, capsys):

@@ -21,7 +21,7 @@ ROWS = [
     ("compare --minutes nan", "--minutes is nan: must be at least 0"),
     ("compare --devices -1", "--devices is -1: must be at least 0"),
     ("compare --impl x", "--impl: there is no 'x'"),
-    ("compare --tuned --tasks push", "--tuned: runs/tuned/push holds no options for guarded, sgft-sac, sgft-relabel,"),
+    ("compare --tuned --tasks push", "--tuned: runs/tuned/push holds no options for guarded, posterior, sgft-sac,"),
     ("compare --out file --dry", "file is a file"),
     ("compare --out loop --dry", "loop is a link that leads nowhere"),
     ("compare --out " + 300 * "x" + " --dry", "file name too long"),

@@ -62,11 +62,11 @@ def real(**effects):
 def test_every_rollout_is_remembered_and_chooses_anew():
     fine, seeds = build(), jnp.array([0, 1], jnp.uint32)
     start = jax.tree.map(lambda x: x[None], prior().params)
-    states = list(finetuning.finetune(fine, real(action_scale=0.7), start, seeds, rollouts=3))
+    states = list(finetuning.finetune(fine, real(action_scale=0.7), start, seeds, rollouts=2))
     progress, metrics = states[-1]
     known = progress.agent.interface
     assert (
-        known.count.tolist() == [3, 3] and known.rollouts.valid[:, :3].all() and not known.rollouts.valid[:, 3:].any()
+        known.count.tolist() == [2, 2] and known.rollouts.valid[:, :2].all() and not known.rollouts.valid[:, 2:].any()
     )
     for name in ("prior", "chosen"):
         assert ((metrics[f"posterior/{name}"] >= 0) & (metrics[f"posterior/{name}"] <= 1)).all()
