@@ -133,6 +133,7 @@ def rollouts(folder):
     return [store.load(i) for i in range(len(store))]
 
 
+@pytest.mark.slow
 def test_sensors_drift_from_rollout_to_rollout_also_of_a_run_that_goes_on(home, tmp_path, monkeypatch):
     """By 100 m along x; evaluations after k rollouts see the system as it is then, and a system without drift none."""
     (home / "drifting.toml").write_text("drift = { xy = [100.0, 0.0] }\n")

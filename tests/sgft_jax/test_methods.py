@@ -211,7 +211,7 @@ def test_without_the_ratio_sgft_relabel_is_what_it_was():
 
 
 @pytest.mark.heavy
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", tuners.slow_but({*METHODS} - {"sgft-tdmpc2", "sgft-tdmpc2-code"}, METHODS))
 def test_what_is_exported_acts_as_the_agent_does(name):
     """So evaluations play what is saved, in one program."""
     case = tuners.tuner(name)
