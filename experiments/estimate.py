@@ -52,7 +52,7 @@ def main(args: EstimateArgs) -> None:
     from sgft_jax.types import Prior
 
     env = envs.make(task, choose_impl(args.impl), **observed_by(folders))
-    priors = load_priors(folders, env)
+    priors, entry = load_priors(folders, env), entry_of(env)
     policy = sac_policy(env.obs_dim, env.act_dim, network_of(priors[0].card))
     with doing(f"compiling the simulator and worlds of {env.name}", 40, once=True):
         env.prepare()
@@ -60,7 +60,7 @@ def main(args: EstimateArgs) -> None:
     params = [prior.params for prior in priors]
     estimator, gained = learned(env, systems, policy, params, lessons=args.lessons, updates=args.updates)
     for folder, prior in zip(folders, priors, strict=True):
-        card = {**prior.card, "estimator": entry_of(env)}
+        card = {**prior.card, "estimator": entry}
         print(save_prior(folder, Prior(prior.params._replace(estimator=estimator), card)))
     for number, nats in gained.items():
         print(f"after {number} rollouts it is {nats:.1f} nats surer of a system than before any")

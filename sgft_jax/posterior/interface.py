@@ -41,12 +41,7 @@ class Believed(NamedTuple):
 
 
 def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interface:
-    """Identification by the estimator of a prior. env: the task in the simulator, as the policy observes it.
-
-    Raises UserError for a task that is not judged by success.
-    """
-    if env.score != "success":
-        raise UserError(f"the posterior promises success, and {env.name} is judged by its return; take another method")
+    """Identification by the estimator of a prior. env: the task in the simulator, as the policy observes it."""
     nothing, steps = none(env.act_dim, env.measured_dim), env.episode_length
     blank = Rollout(
         jnp.zeros((MOST, steps + 1, env.measured_dim)),
@@ -91,6 +86,8 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interf
 
 
 def entry_of(env: Env) -> dict[str, Any]:
-    """What the card of a prior says of an estimator for a task."""
+    """What the card of a prior says of an estimator for a task. Raises UserError for one not judged by success."""
+    if env.score != "success":
+        raise UserError(f"the posterior promises success, and {env.name} is judged by its return; take another method")
     unknowns = [unknown._asdict() for unknown in unknowns_of(env)]
     return {"unknowns": unknowns, "steps": env.episode_length, "measured": env.measured_dim}
