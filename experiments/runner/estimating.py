@@ -35,7 +35,10 @@ def learned(
     some = jax.jit(lambda params, key: simulate(env, systems, policy, params, key, size))
     test = jax.jit(lambda key: simulate(env, systems, policy, params[0], key, min(size, _TEST)))
     start = jax.jit(begin)
-    steps = {n: jax.jit(functools.partial(_step, n, per_call, updates), donate_argnums=0) for n in TOGETHER}
+    steps = {
+        n: jax.jit(functools.partial(learn, together=n, updates=per_call, total=updates), donate_argnums=0)
+        for n in TOGETHER
+    }
     with compiling() as ahead:
         with doing(f"simulating {parts * size * MOST} rollouts of {env.name} to learn from", 100):
             first = some(params[0], key_play)
@@ -56,10 +59,6 @@ def learned(
                 jax.block_until_ready(learning)
                 far((i + 1) / count)
         return learning.estimator, _gained(learning.estimator, test(jax.random.fold_in(key_play, parts)))
-
-
-def _step(together: int, updates: int, total: int, *args: PyTree) -> PyTree:
-    return learn(*args, together=together, updates=updates, total=total)
 
 
 def _gained(estimator: Estimator, lessons: Lessons) -> dict[int, float]:

@@ -34,7 +34,7 @@ from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.models.distortion import Distortion, none
 from sgft_jax.posterior.candidates import Candidates, candidates
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, play
-from sgft_jax.posterior.estimator import Estimator, Rollout, draw, rollout_of
+from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
 from sgft_jax.stacking import stack
 
@@ -153,7 +153,6 @@ def _calibrate(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
     """A line for each number of rollouts."""
     estimator = _estimator(setup)
     true, rollouts = _played(args, setup, max(args.rollouts))
-
     judged = jax.jit(functools.partial(_judged, setup, estimator, true, _padded(rollouts)))
     lines = []
     for number in (0, *args.rollouts):
@@ -196,20 +195,17 @@ def _deploy(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
         lowest = np.argsort(np.asarray(look))[:_GAPS]
         which = jnp.asarray(np.repeat(lowest, _RUNS))
         before = evaluate(setup.nothing(), which, key_before, episodes=_EVALUATED)
-    first = jax.tree.map(lambda x: jnp.repeat(x[None], len(which), axis=0), setup.nothing())
-    shape = jax.eval_shape(functools.partial(_rollout, setup, real), which[0], setup.nothing(), key)
-    runs = _Runs(which, first, jax.tree.map(lambda x: jnp.zeros((len(which), MOST, *x.shape), x.dtype), shape))
+    room = blank(MOST, setup.env.episode_length, setup.env.measured_dim, setup.env.act_dim)
+    begun = jax.tree.map(lambda x: jnp.repeat(x[None], len(which), axis=0), (setup.nothing(), room))
+    runs = _Runs(which, *begun)
     step = jax.jit(functools.partial(_adapted, setup, real, estimator))
     lines = []
     for number in range(max(args.rollouts) + 1):
         with doing("playing, and choosing what to deploy", 60):
             runs, promised, played = step(runs, jnp.int32(number), jax.random.fold_in(key_run, number))
-        names = [real.names[i] for i in np.asarray(which)]
-        by_gap = {
-            name: [float(np.mean([x[i] for i, other in enumerate(names) if other == name])) for x in (before, played)]
-            for name in names
-        }
-        numbers = (np.asarray(x) for x in (promised, before, played))
+        numbers = [np.asarray(x) for x in (promised, before, played)]
+        means = np.stack(numbers[1:], axis=1).reshape(len(lowest), _RUNS, 2).mean(axis=1)
+        by_gap = {real.names[i]: mean.tolist() for i, mean in zip(lowest, means, strict=True)}
         lines.append({"rollouts": number} | _kept(*numbers) | {"gaps": by_gap})
     return lines
 
@@ -243,10 +239,10 @@ def _success(setup: Setup, real: _Real, deployed: Distortion, which: Array, key:
     """[R] success in real systems [R] of what is deployed, in one of them or [R]."""
 
     def one(deployed: Distortion, which: Array, key: Key) -> Array:
-        def play(key: Key) -> Array:
+        def success(key: Key) -> Array:
             return _play(setup, real, which, deployed, key).success
 
-        return jax.vmap(play)(jax.random.split(key, episodes)).mean()
+        return jax.vmap(success)(jax.random.split(key, episodes)).mean()
 
     alike = deployed.bias.ndim == 1
     return jax.vmap(one, (None if alike else 0, 0, 0))(deployed, which, jax.random.split(key, len(which)))
@@ -295,7 +291,8 @@ def _adapted(
 
 def _estimator(setup: Setup) -> Estimator:
     if setup.params.estimator is None:
-        raise UserError("--priors: have no estimator; `python -m experiments.estimate` gives them one")
+        fix = "`python -m experiments.estimate` makes it, --priors names its folder"
+        raise UserError(f"the prior of {setup.env.name} has no estimator; {fix}")
     return setup.params.estimator
 
 

@@ -82,24 +82,20 @@ def _params(card: Mapping[str, Any], paths: Sequence[str], leaves: Sequence[Any]
     container, tree = algorithm_of(card).params(), _nest(paths, leaves)
     if odd := sorted(set(tree) - set(container._fields)):
         raise UserError(f"holds {', '.join(odd)}, which this version does not know; pretrain again")
-    for name, kind in (("normalizer", Normalizer), ("distortion", Distortion)):
+    for name, kind in (("normalizer", Normalizer), ("distortion", Distortion), ("estimator", Estimator)):
         if (part := tree.get(name)) is not None:
-            if not isinstance(part, dict) or set(part) != set(kind._fields):
-                raise UserError(f"its {name} is not of {', '.join(kind._fields)}; pretrain again")
-            tree[name] = kind(**part)
-    if (part := tree.get("estimator")) is not None:
-        tree["estimator"] = _estimator(part)
+            tree[name] = _made(kind, part, name)
+    if (estimator := tree.get("estimator")) is not None:
+        statistics = _made(Statistics, estimator.statistics, "estimator's statistics")
+        tree["estimator"] = estimator._replace(statistics=statistics)
     return container(**{name: tree.get(name) for name in container._fields})
 
 
-def _estimator(part: Any) -> Estimator:
-    """The estimator that a tree of dicts describes."""
-    if not isinstance(part, dict) or set(part) != set(Estimator._fields):
-        raise UserError(f"its estimator is not of {', '.join(Estimator._fields)}; make it anew")
-    known = part["statistics"]
-    if not isinstance(known, dict) or set(known) != set(Statistics._fields):
-        raise UserError(f"the statistics of its estimator are not {', '.join(Statistics._fields)}; make it anew")
-    return Estimator(part["params"], Statistics(**known))
+def _made(kind: Any, part: Any, name: str) -> Any:
+    """The NamedTuple that a dict describes."""
+    if not isinstance(part, dict) or set(part) != set(kind._fields):
+        raise UserError(f"its {name} is not of {', '.join(kind._fields)}; pretrain again")
+    return kind(**part)
 
 
 def _check_parameters(card: Mapping[str, Any], params: Any, described: Iterable[tuple[str, Network, PyTree]]) -> None:

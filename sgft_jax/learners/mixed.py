@@ -100,7 +100,7 @@ def step_critic(
 
 def step_policy(nets: Networks, state: Any, batch: Batch, key: Key) -> tuple[optim.Fit, optim.Fit, Metrics]:
     """Actor, and temperature where `nets.config.tune_alpha`, after a step on the states of all rows."""
-    fit, _, log_prob, metrics = steps.step_actor(nets, state, batch, key, rate=state.hyper.lr_actor)
+    fit, log_prob, metrics = steps.step_actor(nets, state, batch, key, rate=state.hyper.lr_actor)
     log_alpha = state.log_alpha
     if nets.config.tune_alpha:  # the released loss has log alpha in the place of alpha: with Adam nearly the same
         target, rate = state.hyper.entropy_per_dim * nets.config.act_dim, state.hyper.lr_alpha

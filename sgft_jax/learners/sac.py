@@ -296,7 +296,7 @@ def _update_actor(nets: Networks, state: SACState, rows: Batch, key: Key) -> tup
 
     rate = hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp)
     mean, penalty = config.actor_mean, divergence if config.anchored else None
-    fit, _, log_prob, metrics = steps.step_actor(nets, state, rows, key, rate=rate, mean=mean, penalty=penalty)
+    fit, log_prob, metrics = steps.step_actor(nets, state, rows, key, rate=rate, mean=mean, penalty=penalty)
     fit = optax.tree.where((since >= 0) & _policy_turn(config, state), fit, state.actor)
     return state.replace(actor=fit), log_prob, metrics
 

@@ -130,26 +130,26 @@ def step_actor(
     rate: Array | float,
     mean: bool = False,
     penalty: Callable[[PyTree, Array], Array] | None = None,
-) -> tuple[optim.Fit, Array, Array, Metrics]:
+) -> tuple[optim.Fit, Array, Metrics]:
     """The actor after a step on alpha log pi(a|s) - min_i Q_i(s, a) with a ~ pi. Source: H2O+ Eq. (10).
 
-    Also returns q [B, members] and log pi [B] of the actions drawn. mean: follow the members' mean, not their minimum.
+    Also returns log pi [B] of the actions drawn. mean: follow the members' mean, not their minimum.
     penalty(params, obs) -> [] joins the loss of each row.
     """
     alpha, keys = jnp.exp(state.log_alpha.params), jax.random.split(key, rows.reward.shape[0])
 
-    def row_loss(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array, Array]:
+    def row_loss(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array]:
         action, log_prob = networks.tanh_gaussian_sample(nets.actor.apply(params, obs), key)
         q = nets.critic.apply(state.critic.params, obs, action)
         loss = losses.actor_loss(log_prob, jnp.mean(q, keepdims=True) if mean else q, alpha=alpha)
-        return loss if penalty is None else loss + penalty(params, obs), q, log_prob
+        return loss if penalty is None else loss + penalty(params, obs), log_prob
 
-    def loss(params: PyTree) -> tuple[Array, tuple[Array, Array]]:
-        values, q, log_prob = jax.vmap(row_loss, (None, 0, 0))(params, rows.obs, keys)
-        return losses.row_mean(values, rows), (q, log_prob)
+    def loss(params: PyTree) -> tuple[Array, Array]:
+        values, log_prob = jax.vmap(row_loss, (None, 0, 0))(params, rows.obs, keys)
+        return losses.row_mean(values, rows), log_prob
 
-    fit, value, (q, log_prob) = optim.minimise(nets.optimiser, loss, state.actor, rate)
-    return fit, q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
+    fit, value, log_prob = optim.minimise(nets.optimiser, loss, state.actor, rate)
+    return fit, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
 
 
 def step_temperature(

@@ -11,6 +11,8 @@ from sgft_jax import checks
 from sgft_jax.train.options import LoopOptions, card_of
 from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
+_MAKE = "`python -m experiments.estimate --prior PRIOR` makes it"
+
 
 @dataclass(frozen=True)
 class Config(checks.Checked):
@@ -53,6 +55,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return assemble(parts, loop, task)._replace(updates_per_rollout=1)
 
 
-_MAKE = "`python -m experiments.estimate --prior PRIOR` makes it"
 _ABOUT = "the prior behind a correction that is tried in the systems that rollouts allow"
 METHOD = Method("posterior", Online("model-based", _ABOUT, "ours", Config, build))

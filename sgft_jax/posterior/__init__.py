@@ -1,1 +1,1 @@
-"""Which system is this? Candidates replay what the real one did; the posterior says which policy to deploy."""
+"""Which simulated systems may have made real rollouts, and which policy is best to deploy in them."""

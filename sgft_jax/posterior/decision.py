@@ -25,7 +25,7 @@ _LEAST = 0.02  # and at least so much
 CANDIDATES, JUDGES = 16, 32  # points of the posterior whose corrections are tried, and in which they are tried
 _EPISODES = 2  # that a finalist plays in each
 
-Play = Callable[[PyTree, World, Key], Array]  # (what acts, a world, key) -> [] bool, success of an episode there
+Trial = Callable[[PyTree, World, Key], Array]  # (what acts, a world, key) -> [] bool, success of an episode there
 
 
 class Decision(NamedTuple):
@@ -77,7 +77,7 @@ def choose(
 
 
 def decide(
-    play: Play, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int
+    trial: Trial, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int
 ) -> Decision:
     """The candidate of the highest expected success; the prior as it is unless another is clearly better.
 
@@ -86,10 +86,10 @@ def decide(
     same episodes: their differences are paired.
     """
     key_first, key_final = jax.random.split(key)
-    first = _table(play, acting, candidates, particles, key_first, episodes=1)
+    first = _table(trial, acting, candidates, particles, key_first, episodes=1)
     best = 1 + jax.lax.top_k(first[1:].mean(axis=1), min(_FINALISTS, len(first) - 1))[1]
     finalists = jnp.concatenate([jnp.zeros(1, best.dtype), best])
-    table = _table(play, member(acting, finalists), candidates, particles, key_final, episodes=episodes)
+    table = _table(trial, member(acting, finalists), candidates, particles, key_final, episodes=episodes)
     gains = table - table[:1]
     error = gains.std(axis=1) / np.sqrt(len(particles))
     clear = gains.mean(axis=1) > jnp.maximum(_CLEARLY * error, _LEAST)
@@ -98,14 +98,14 @@ def decide(
     return Decision(finalists[winner], expected, expected[winner])
 
 
-def _table(play: Play, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int) -> Array:
+def _table(trial: Trial, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int) -> Array:
     """[J, I] success of each candidate in each particle."""
     keys = jax.random.split(key, (len(particles), episodes))
 
     def of_particle(acts: PyTree, point: Array, keys: Key) -> Array:
         def episode(key: Key) -> Array:
             key_world, key_play = jax.random.split(key)
-            return play(acts, candidates.episode(point, key_world), key_play)
+            return trial(acts, candidates.episode(point, key_world), key_play)
 
         return jax.vmap(episode)(keys).mean()
 

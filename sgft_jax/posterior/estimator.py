@@ -105,15 +105,20 @@ def rollout_of(env: Env, rows: Transition, valid: Array, success: Array) -> Roll
     return Rollout(measured, rows.action, valid, success)
 
 
+def blank(k: int, steps: int, measured: int, act_dim: int) -> Rollout:
+    """Room for k rollouts of so many steps, measurements and actions."""
+    return Rollout(
+        jnp.zeros((k, steps + 1, measured)),
+        jnp.zeros((k, steps, act_dim)),
+        jnp.zeros((k, steps), bool),
+        jnp.zeros(k, bool),
+    )
+
+
 def shaped(steps: int, measured: int, act_dim: int, d: int) -> Estimator:
     """Zeros of the shapes that an estimator has for rollouts of so many steps, measurements and actions."""
-    rollout = Rollout(
-        jnp.zeros((1, 1, steps + 1, measured)),
-        jnp.zeros((1, 1, steps, act_dim)),
-        jnp.ones((1, 1, steps), bool),
-        jnp.zeros((1, 1), bool),
-    )
-    shapes = jax.eval_shape(lambda: init(jax.random.key(0), rollout, d))
+    rollouts = jax.tree.map(lambda x: x[None], blank(1, steps, measured, act_dim))
+    shapes = jax.eval_shape(lambda: init(jax.random.key(0), rollouts, d))
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
 

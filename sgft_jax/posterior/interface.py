@@ -14,7 +14,7 @@ from envs.types import Array, Key, Policy, PyTree, UserError
 from sgft_jax.models.distortion import Distortion, Interface, Seen, none
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
-from sgft_jax.posterior.estimator import Estimator, Rollout, draw, rollout_of
+from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
 from sgft_jax.posterior.trust import Trust, begin, deploys, expected, told
 
@@ -42,20 +42,15 @@ class Believed(NamedTuple):
 
 def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interface:
     """Identification by the estimator of a prior. env: the task in the simulator, as the policy observes it."""
-    nothing, steps = none(env.act_dim, env.measured_dim), env.episode_length
-    blank = Rollout(
-        jnp.zeros((MOST, steps + 1, env.measured_dim)),
-        jnp.zeros((MOST, steps, env.act_dim)),
-        jnp.zeros((MOST, steps), bool),
-        jnp.zeros(MOST, bool),
-    )
+    nothing = none(env.act_dim, env.measured_dim)
+    room = blank(MOST, env.episode_length, env.measured_dim, env.act_dim)
 
     def start(params: PyTree, key: Key) -> Believed:
         if params.estimator is None:
             raise UserError("this prior has no estimator of systems; `python -m experiments.estimate` makes it")
         acting = params._replace(estimator=None, critic=None, value=None, dynamics=None)
         nan, no = jnp.full(2, jnp.nan), jnp.zeros((), bool)
-        return Believed(acting, params.estimator, blank, jnp.int32(0), begin(), no, nothing, nan, key)
+        return Believed(acting, params.estimator, room, jnp.int32(0), begin(), no, nothing, nan, key)
 
     def refit(known: Believed, seen: Seen) -> Believed:
         if seen.rollout is None:  # of a log, which does not tell success
