@@ -52,7 +52,7 @@ def main(args: EstimateArgs) -> None:
     from sgft_jax.types import Prior
 
     env = envs.make(task, choose_impl(args.impl), **observed_by(folders))
-    priors, entry = load_priors(folders, env), entry_of(env)
+    priors, entry = load_priors(folders, env, estimators=True), entry_of(env)
     policy = sac_policy(env.obs_dim, env.act_dim, network_of(priors[0].card))
     with doing(f"compiling the simulator and worlds of {env.name}", 40, once=True):
         env.prepare()

@@ -24,6 +24,7 @@ from sgft_jax.export import player
 from sgft_jax.io.cards import known_task
 from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
+from sgft_jax.posterior.estimator import without_estimator
 from sgft_jax.presets import check_card
 from sgft_jax.stacking import member, stack
 from sgft_jax.systems.simulated import Simulated, System
@@ -91,7 +92,8 @@ def setup(
         which = jnp.repeat(jnp.arange(copies), len(numbers))
         pools, drift = real_worlds(scene, gaps, jax.random.key(0)), drifts(scene, gaps)
         system = Simulated(scene, pools, which, gamma=gamma, drift=drift)
-    stacked = stack([prior.params for prior in known]) if known else None
+    params = [prior.params if finetuner.estimates else without_estimator(prior.params) for prior in known]
+    stacked = stack(params) if known else None
     members = jnp.tile(jnp.array(list(numbers), jnp.uint32), copies)
     needs = finetuner.simulation
     if needs is None:
@@ -161,7 +163,7 @@ def finetuned_priors(setup: Setup, state: FinetuneProgress, prior: Prior, *, bes
     did best in the real rollouts; False: the last ones.
     """
     params = state.best.params if best else jax.vmap(setup.finetuner.export)(state.agent)
-    card = {**prior.card, **setup.finetuner.card}
+    card = {**prior.card, "estimator": None, **setup.finetuner.card}
     copied = jax.tree.map(jnp.copy, params)  # the state's arrays may be donated
     return [Prior(member(copied, i), card) for i in range(len(setup.seeds))]
 

@@ -254,6 +254,7 @@ class Finetuner(NamedTuple):
     simulation: the simulated data that the method needs, or None.
     card: what the card of an exported policy says beyond the prior's, such as the options of a plan.
     guarded: whether a guard chooses who acts: that is `policy` with what `export` returns.
+    estimates: whether it reads the estimator of a prior.
     """
 
     init: Callable[[PyTree, Key], PyTree]
@@ -270,6 +271,7 @@ class Finetuner(NamedTuple):
     simulation: Simulation | None
     card: Mapping[str, Any]
     guarded: bool = False
+    estimates: bool = False
 
 
 ValueLoss = Literal["iql", "sql", "eql", "xql"]

@@ -65,7 +65,7 @@ def test_the_wheel_holds_the_packages_without_studies(wheel):
     expected = {name for name in tracked.stdout.split() if not name.startswith("experiments/studies/")}
     assert {name for name in names if ".dist-info/" not in name} == expected
     assert {f"{package}/py.typed" for package in PACKAGES} <= expected
-    assert wheel.stat().st_size < 8e6
+    assert wheel.stat().st_size < 14e6  # three estimators are half of it
 
 
 def test_every_module_can_be_imported(installed, tmp_path):

@@ -12,7 +12,7 @@ from envs.types import Array, Policy, PyTree
 from experiments.runner.ahead import compiling
 from experiments.runner.progress import doing, far
 from sgft_jax.posterior.candidates import Candidates
-from sgft_jax.posterior.estimator import Estimator, log_density
+from sgft_jax.posterior.estimator import Estimator, at_half_precision, log_density
 from sgft_jax.posterior.learning import MOST, TOGETHER, Lessons, begin, learn, simulate
 from sgft_jax.stacking import join
 
@@ -58,7 +58,8 @@ def learned(
                     learning = step(learning, seen, jax.random.fold_in(jax.random.fold_in(key_learn, i), n))
                 jax.block_until_ready(learning)
                 far((i + 1) / count)
-        return learning.estimator, _gained(learning.estimator, test(jax.random.fold_in(key_play, parts)))
+        estimator = at_half_precision(learning.estimator)  # what is saved is what is judged
+        return estimator, _gained(estimator, test(jax.random.fold_in(key_play, parts)))
 
 
 def _gained(estimator: Estimator, lessons: Lessons) -> dict[int, float]:

@@ -62,7 +62,7 @@ def run(
     env = envs.make(args.task, args.impl, **observed_by(folders))
     _reserve(args, env, len(folders), devices)
     systems = [real_systems.described(env, name, args.set) for name in args.real]
-    priors = load_priors(folders, env)
+    priors = load_priors(folders, env, estimators=True)
     for prior in priors:
         api.check_prior(prior, method, env)
     card = card_of(priors[0] if priors else None)
@@ -376,7 +376,7 @@ class _Run(Training):
     def _finish(self, progress: FinetuneProgress) -> list[dict[str, Any]]:
         """Policies, summaries, figures and films."""
         best = progress.best
-        card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
+        card = {**self.card, "plan": None, "estimator": None, **self.finetuner.card}  # those were the prior's
         last = finetuning.exported(self.finetuner.export, progress.agent)
         facts = {"evidence": best.score, "rollouts": best.age}
         n = self.episodes

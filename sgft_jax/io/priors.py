@@ -20,10 +20,12 @@ from sgft_jax.io import checkpoint
 from sgft_jax.io.cards import CARD, read_card, resolve_shipped
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.networks import Network, check_params
-from sgft_jax.posterior.estimator import Estimator, Statistics
+from sgft_jax.posterior.estimator import Estimator, Statistics, without_estimator
 from sgft_jax.types import Normalizer, Prior
 
 __all__ = ["load_prior", "save_prior"]
+
+_ESTIMATOR = "float16"  # what its numbers are on disk
 
 
 def save_prior(folder: str | Path, prior: Prior) -> Path:
@@ -31,12 +33,14 @@ def save_prior(folder: str | Path, prior: Prior) -> Path:
 
     The card must have `task`, `obs_dim` and `act_dim`, which are checked on loading, `gamma` (the discount), and
     `algorithm` unless that is SAC. Parameters must be NamedTuples and dicts of arrays: such a prior can be read without
-    the code that describes its networks. Raises ValueError or TypeError otherwise, and UserError where `folder` holds
-    something else.
+    the code that describes its networks. An estimator is written in half precision. Raises ValueError or TypeError
+    otherwise, and UserError where `folder` holds something else.
     """
     if missing := {"task", "obs_dim", "act_dim", "gamma"} - set(prior.card):
         raise ValueError(f"the prior's card lacks {sorted(missing)}")
     tree, folder = _plain(prior.params), Path(folder)
+    if "estimator" in tree:
+        tree["estimator"] = jax.tree.map(lambda x: np.asarray(x, _ESTIMATOR), tree["estimator"])
     if folder.is_dir() and any(folder.iterdir()) and not (folder / CARD).exists():
         raise UserError(f"{folder}: holds something else than a prior; choose another folder")
     with checkpoint.replaced(folder) as temporary:
@@ -74,7 +78,7 @@ def load_prior(
     arrays = checkpoint.read_leaves(folder, manifest)
     if odd := [path for path, x in zip(paths, arrays, strict=True) if not np.isfinite(x).all()]:
         raise UserError(f"{folder}: {odd[0]} holds numbers that are not finite; take another prior, or pretrain again")
-    return Prior(_params(card, paths, arrays), card)
+    return Prior(_params(card, paths, [jnp.asarray(x, jnp.float32) for x in arrays]), card)
 
 
 def _params(card: Mapping[str, Any], paths: Sequence[str], leaves: Sequence[Any]) -> Any:
@@ -121,8 +125,10 @@ def _check_parameters(card: Mapping[str, Any], params: Any, described: Iterable[
             raise UserError(f"{name} has the shapes {shapes}, by its card {wanted}; take another prior")
     for name, network, part in described:
         check_params(name, network, part, "its card; take another prior")
-    if odd := [path for path, x in jax.tree_util.tree_leaves_with_path(params) if x.dtype != jnp.float32]:
-        raise UserError(f"{jax.tree_util.keystr(odd[0])} is not float32; take another prior")
+    for path, x in jax.tree_util.tree_leaves_with_path(params):
+        stored = _ESTIMATOR if path[0].name == "estimator" else "float32"
+        if x.dtype != stored:
+            raise UserError(f"{jax.tree_util.keystr(path)} is not {stored}; take another prior")
 
 
 def _offsets(params: Any, obs_dim: int, act_dim: int) -> int:
@@ -143,17 +149,18 @@ def observed_by(folders: Sequence[Path]) -> dict[str, Any]:
     return observed(read_card(home) if home is not None and (home / CARD).exists() else {})
 
 
-def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
+def load_priors(folders: Sequence[Path], env: Any, *, estimators: bool = False) -> list[Prior]:
     """Priors that are used together; raises UserError where they differ in more than their numbers.
 
-    env: what has the `name`, `obs_dim` and `act_dim` that they must have.
+    env: what has the `name`, `obs_dim` and `act_dim` that they must have. estimators: whether those that have one keep
+    it, which few need.
     """
     priors = [load_prior(folder, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim) for folder in folders]
     for folder, prior in zip(folders, priors, strict=True):
         if odd := differences(_structure(priors[0].card), _structure(prior.card)):
             names = sorted({name.partition(".")[0] for name, *_ in odd})
             raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(names)}; choose one with --prior")
-    return priors
+    return priors if estimators else [Prior(without_estimator(prior.params), prior.card) for prior in priors]
 
 
 def _home(folder: str | Path) -> Path:

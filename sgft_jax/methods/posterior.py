@@ -52,7 +52,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     parts = unlearned(policy, start, export)
     parts = parts._replace(interface=posterior_interface(task, candidates(task), policy))
     loop = LoopOptions(initial_rollouts=config.initial_rollouts)
-    return assemble(parts, loop, task)._replace(updates_per_rollout=1)
+    return assemble(parts, loop, task)._replace(updates_per_rollout=1, estimates=True)
 
 
 _ABOUT = "the prior behind a correction that is tried in the systems that rollouts allow"

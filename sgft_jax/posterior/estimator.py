@@ -115,6 +115,16 @@ def blank(k: int, steps: int, measured: int, act_dim: int) -> Rollout:
     )
 
 
+def at_half_precision(estimator: Estimator) -> Estimator:
+    """The same in numbers that half precision has, which are what a prior's file holds."""
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float16).astype(jnp.float32), estimator)
+
+
+def without_estimator(params: PyTree) -> PyTree:
+    """A prior's params without the estimator that they may have: megabytes that most have no use for."""
+    return params if getattr(params, "estimator", None) is None else params._replace(estimator=None)
+
+
 def shaped(steps: int, measured: int, act_dim: int, d: int) -> Estimator:
     """Zeros of the shapes that an estimator has for rollouts of so many steps, measurements and actions."""
     rollouts = jax.tree.map(lambda x: x[None], blank(1, steps, measured, act_dim))

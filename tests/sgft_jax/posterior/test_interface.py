@@ -12,7 +12,8 @@ from envs import gaps
 from envs.rollout import real_worlds
 from sgft_jax.data.replay import blank
 from sgft_jax.files.disk import jsonable
-from sgft_jax.io.priors import load_prior, save_prior
+from sgft_jax.io import priors
+from sgft_jax.io.priors import load_prior, load_priors, save_prior
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.methods import get_method
 from sgft_jax.models.config import NetworkConfig
@@ -103,7 +104,23 @@ def test_a_prior_keeps_its_estimator_on_disk(tmp_path):
     folder = save_prior(tmp_path / "prior", prior())
     again = load_prior(folder)
     assert again.card["estimator"] == entry_of(TOY)
-    assert jax.tree.all(jax.tree.map(jnp.array_equal, again.params.estimator, prior().params.estimator))
+    half = estimator.at_half_precision(prior().params.estimator)
+    assert jax.tree.all(jax.tree.map(jnp.array_equal, again.params.estimator, half))
+    assert {x.dtype for x in jax.tree.leaves(again.params)} == {jnp.dtype("float32")}
+    (other,) = load_priors([folder], TOY)
+    assert other.params.estimator is None
+
+
+def test_only_an_estimator_is_of_half_precision(tmp_path, monkeypatch):
+    """Files in other precisions, as no version writes them."""
+    whole = Prior(prior().params._replace(actor=jax.tree.map(jnp.float16, prior().params.actor)), prior().card)
+    with pytest.raises(UserError, match="actor.* is not float32; take another prior"):
+        load_prior(save_prior(tmp_path / "half", whole))
+    monkeypatch.setattr(priors, "_ESTIMATOR", "float32")
+    folder = save_prior(tmp_path / "whole", prior())
+    monkeypatch.undo()
+    with pytest.raises(UserError, match="estimator.* is not float16; take another prior"):
+        load_prior(folder)
 
 
 def test_an_estimator_that_the_card_does_not_describe_is_refused(tmp_path):
