@@ -76,6 +76,16 @@ def choose(
     return member(acting, decision.chosen), jnp.stack([decision.expected[0], decision.promised])
 
 
+def judged(env: Env, candidates: Candidates, policy: Policy, params: PyTree, particles: Array, key: Key) -> Array:
+    """[] success of a policy in the episodes of systems [I, d] in which `choose` with this key judges its finalists."""
+
+    def success(params: PyTree, world: World, key: Key) -> Array:
+        return play(env, policy, params, world, key).success
+
+    key_final = jax.random.split(key)[1]
+    return _table(success, stack([params]), candidates, particles, key_final, episodes=_EPISODES).mean()
+
+
 def decide(
     trial: Trial, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int
 ) -> Decision:

@@ -1,7 +1,8 @@
 """How fine-tuning uses the posterior: every rollout says anew behind which correction the policy acts. Pure.
 
 The candidates play in the simulator what the prior's policy would do there, see `decision`; real rollouts say how far
-to trust what they promise, see `trust`.
+to trust what they promise, and so whether the prior as it is, behind a correction, or what learns is deployed, see
+`trust`.
 """
 
 from typing import Any, NamedTuple
@@ -10,34 +11,45 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Env
-from envs.types import Array, Key, Policy, PyTree, UserError
+from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.models.distortion import Distortion, Interface, Seen, none
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
-from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
+from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, judged
 from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
-from sgft_jax.posterior.trust import Trust, begin, deploys, expected, told
+from sgft_jax.posterior.trust import AS_IS, CORRECTED, LEARNED, Trust, begin, choice, expected, faded, told
+from sgft_jax.stacking import member, stack
+from sgft_jax.types import Finetuner, Metrics, SimulatedData
 
 
 class Believed(NamedTuple):
     """What is known of one real system.
 
     params: of the policy that plays in simulation, without an estimator. rollouts: [MOST] the last ones, and `count` []
-    how many there have been. trust: in simulation. deployed: [] bool, whether that is deployed which is chosen by
-    simulation, instead of the prior as it is. distortion: what it corrects then, else nothing. promised: [2] the
-    success that simulation promises for the prior and for what is chosen, nan before any rollout. key: of the next
-    choice.
+    how many there have been. judges: [JUDGES, d] systems that may be the real one. distortion: what the policy that
+    is chosen corrects, and the one that learns. promised: [3] the success that simulation promises for the policies of
+    `trust`, nan for those that it has not tried. key: of all choices.
     """
 
     params: PyTree
     estimator: Estimator
     rollouts: Rollout
     count: Array
-    trust: Trust
-    deployed: Array
+    judges: Array
     distortion: Distortion
     promised: Array
     key: Key
+
+
+class Deployed(NamedTuple):
+    """agent: the state of what learns, or adapts. first: params of the simulator's policy. which: [] the policy of
+    `trust` that is deployed.
+    """
+
+    agent: PyTree
+    first: PyTree
+    trust: Trust
+    which: Array
 
 
 def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interface:
@@ -48,36 +60,83 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interf
     def start(params: PyTree, key: Key) -> Believed:
         if params.estimator is None:
             raise UserError("this prior has no estimator of systems; `python -m experiments.estimate` makes it")
-        acting = params._replace(estimator=None, critic=None, value=None, dynamics=None)
-        nan, no = jnp.full(2, jnp.nan), jnp.zeros((), bool)
-        return Believed(acting, params.estimator, room, jnp.int32(0), begin(), no, nothing, nan, key)
+        acting, judges = _acting(params), jnp.zeros((JUDGES, len(systems.unknowns)))
+        return Believed(acting, params.estimator, room, jnp.int32(0), judges, nothing, jnp.full(3, jnp.nan), key)
 
     def refit(known: Believed, seen: Seen) -> Believed:
         if seen.rollout is None:  # of a log, which does not tell success
             return known
-        key, key_points, key_choice = jax.random.split(known.key, 3)
         last, place = rollout_of(env, *seen.rollout), known.count % MOST
         rollouts = jax.tree.map(lambda rows, row: rows.at[place].set(row), known.rollouts, last)
-        counts = jnp.arange(MOST) <= known.count
+        known = known._replace(rollouts=rollouts, count=known.count + 1)
+        counts, (key_points, key_choice) = jnp.arange(MOST) < known.count, _keys(known)
         points = draw(known.estimator, rollouts, counts, len(systems.unknowns), key_points, CANDIDATES + JUDGES)
-        choice, promised = choose(env, systems, policy, known.params, points, key_choice)
-        trust = told(known.trust, known.deployed, known.promised[known.deployed.astype(jnp.int32)], last.success)
-        deployed = deploys(trust, promised)
-        return known._replace(
-            rollouts=rollouts,
-            count=known.count + 1,
-            trust=trust,
-            deployed=deployed,
-            distortion=jax.tree.map(lambda a, b: jnp.where(deployed, a, b), choice, nothing),
-            promised=promised,
-            key=key,
-        )
+        distortion, promised = choose(env, systems, policy, known.params, points, key_choice)
+        promised = jnp.append(promised, jnp.nan)
+        return known._replace(judges=points[CANDIDATES:], distortion=distortion, promised=promised)
 
-    def report(known: Believed) -> dict[str, Array]:
-        prior, chosen = expected(known.trust, known.promised)
-        return {"posterior/deployed": known.deployed, "posterior/prior": prior, "posterior/chosen": chosen}
+    return Interface(start, lambda known, simulated: known, refit)
 
-    return Interface(start, lambda known, simulated: known, refit, report)
+
+def deployed(inner: Finetuner, env: Env, systems: Candidates, policy: Policy, *, learns: bool) -> Finetuner:
+    """The same fine-tuning, of which only that is deployed which simulation and real rollouts say is best.
+
+    inner: identifies by `posterior_interface`; its exported params act by `policy`. learns: whether it also learns.
+    `learn` must follow each rollout once, as in `finetuning.finetune`. Metrics: posterior/deployed, the number of the
+    policy of `trust`, and the success that is expected of each.
+    """
+    nothing = none(env.act_dim, env.measured_dim)
+
+    def init(params: PyTree, key: Key) -> Deployed:
+        agent = inner.init(params, key)
+        # A copy: the caller may donate the state, and the prior must survive that.
+        return Deployed(agent, jax.tree.map(jnp.copy, inner.export(agent)), begin(), jnp.int32(AS_IS))
+
+    def prepare(state: Deployed, simulated: SimulatedData | None) -> Deployed:
+        return state._replace(agent=inner.prepare(state.agent, simulated))
+
+    def export(state: Deployed) -> PyTree:
+        corrected = state.first._replace(distortion=state.agent.interface.distortion)
+        return member(stack([state.first, corrected, inner.export(state.agent)]), state.which)
+
+    def act(state: Deployed, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        return policy.act(export(state), carry, obs, key, explore=explore)
+
+    def observe(state: Deployed, rows: Transition, valid: Array, score: Array | None) -> Deployed:
+        if score is None:  # none of the policies has played
+            return state._replace(agent=inner.observe(state.agent, rows, valid, None))
+        trust = told(state.trust, state.which, state.agent.interface.promised, score > 0.5)
+        agent = inner.observe(state.agent, rows, valid, score)
+        # What learns acts behind the correction too, unless the prior as it is is expected to do better without.
+        which, known = choice(trust, agent.interface.promised), agent.interface
+        distortion = jax.tree.map(lambda a, b: jnp.where(which == CORRECTED, a, b), known.distortion, nothing)
+        return Deployed(_believing(agent, known._replace(distortion=distortion)), state.first, trust, which)
+
+    def learn(
+        state: Deployed,
+        key: Key,
+        updates: int,
+        simulated: SimulatedData | None = None,
+        *,
+        offline: bool = False,
+        limit: Array | None = None,
+    ) -> tuple[Deployed, Metrics]:
+        agent, metrics = inner.learn(state.agent, key, updates, simulated, offline=offline, limit=limit)
+        if offline:  # no rollout has been played
+            return state._replace(agent=agent), metrics
+        known, trust = agent.interface, faded(state.trust)
+        if learns:
+            acting, key_choice = _acting(inner.export(agent)), _keys(known)[1]
+            promise = judged(env, systems, policy, acting, known.judges, key_choice)
+            known = known._replace(promised=known.promised.at[LEARNED].set(promise))
+        which = choice(trust, known.promised)
+        names = ("as_is", "corrected", "learned")
+        metrics |= {f"posterior/{n}": x for n, x in zip(names, expected(trust, known.promised), strict=True)}
+        metrics |= {"posterior/deployed": which.astype(jnp.float32)}
+        return Deployed(_believing(agent, known), state.first, trust, which), metrics
+
+    changed = {"init": init, "prepare": prepare, "act": act, "observe": observe, "learn": learn, "export": export}
+    return inner._replace(init_carry=policy.init_carry, guarded=True, estimates=True, **changed)
 
 
 def entry_of(env: Env) -> dict[str, Any]:
@@ -86,3 +145,17 @@ def entry_of(env: Env) -> dict[str, Any]:
         raise UserError(f"the posterior promises success, and {env.name} is judged by its return; take another method")
     unknowns = [unknown._asdict() for unknown in unknowns_of(env)]
     return {"unknowns": unknowns, "steps": env.episode_length, "measured": env.measured_dim}
+
+
+def _acting(params: PyTree) -> PyTree:
+    """What a policy acts by."""
+    return params._replace(estimator=None, critic=None, value=None, dynamics=None)
+
+
+def _keys(known: Believed) -> Array:
+    """[2] of the points that are drawn after the last rollout, and of the choice."""
+    return jax.random.split(jax.random.fold_in(known.key, known.count))
+
+
+def _believing(agent: PyTree, known: Believed) -> PyTree:
+    return agent._replace(interface=known)

@@ -1,9 +1,10 @@
-"""Whether to deploy what simulation promises: real rollouts count for and against its promises. Pure.
+"""Which of three policies to deploy: real rollouts count for and against what simulation promises of them. Pure.
 
-Two policies are compared: the prior as it is, which stays for good, and what the posterior chooses. Either the
-simulator is right about them, then a rollout succeeds as often as it promised, or it says nothing, then only what a
-policy did in real rollouts counts. Every rollout changes how probable the first is (Bayes' rule), by how well it was
-promised. So under a misfit promises fade to the policies' own records, and simulation can neither veto nor promote.
+The three are the prior as it is, which stays for good, the prior behind the correction that the posterior chooses, and
+what learns. Either the simulator is right about them, then a rollout succeeds as often as it promised, or it says
+nothing, then only what a policy did in real rollouts counts. Every rollout changes how probable the first is (Bayes'
+rule), by how well it was promised. So under a misfit promises fade to the policies' own records, and simulation can
+neither veto nor promote; and what learns is tried where the others fail, whatever simulation says.
 
 tests/sgft_jax/posterior/test_trust.py states the errors, for simulators of several biases.
 """
@@ -15,14 +16,18 @@ import jax.numpy as jnp
 
 from envs.types import Array
 
-_RIGHT = 0.8  # probability that a simulator is right, before any rollout
+AS_IS, CORRECTED, LEARNED = range(3)
+
+_RIGHT, _MOST = 0.8, 0.9  # probability that a simulator is right, before any rollout and at most
 _SURE = 0.05  # no promise is surer than this of success or failure
-_WON, _LOST = (1.0, 0.5), (0.5, 1.0)  # imagined rollouts of the prior and of what is chosen
-_CLEARLY = 0.02  # by how much what is chosen must be expected to be better
+_WON, _LOST = (1.0, 0.5), (0.5, 1.0)  # imagined rollouts of the prior as it is and behind a correction
+_CREDIT = 1.0  # imagined rollouts of what learns, half way between the better of these and success
+_CLEARLY, _TIMES = 0.02, 1.2  # a correction must be better by so much, what learns so many times as good
+_FADE = 0.9  # what learns has changed: so many times its rollouts count
 
 
 class Trust(NamedTuple):
-    """log_odds: [] that the simulator is right. won, lost: [2] real rollouts of the prior and of what is chosen."""
+    """log_odds: [] that the simulator is right. won, lost: [3] real rollouts of the policies."""
 
     log_odds: Array
     won: Array
@@ -31,33 +36,43 @@ class Trust(NamedTuple):
 
 def begin() -> Trust:
     """Before any rollout."""
-    return Trust(jnp.log(_RIGHT / (1.0 - _RIGHT)), jnp.array(_WON), jnp.array(_LOST))
+    return Trust(jnp.log(_RIGHT / (1.0 - _RIGHT)), jnp.zeros(3), jnp.zeros(3))
 
 
-def told(trust: Trust, chosen: Array, promised: Array, success: Array) -> Trust:
-    """After a rollout. chosen: [] bool, whether what is chosen played it. promised: [] the success that was promised
-    for it, nan where nothing was. success: [] bool.
+def told(trust: Trust, deployed: Array, promised: Array, success: Array) -> Trust:
+    """After a rollout. deployed: [] which policy played it. promised: [3] success, nan where nothing was. success: []
+    bool.
     """
-    which, success = jnp.asarray(chosen, jnp.int32), jnp.asarray(success, bool)
-    usual = _records(trust)[which]
-    sure = jnp.where(jnp.isnan(promised), usual, jnp.clip(promised, _SURE, 1.0 - _SURE))
+    usual, success = _records(trust)[deployed], jnp.asarray(success, bool)
+    promise = promised[deployed]
+    sure = jnp.where(jnp.isnan(promise), usual, jnp.clip(promise, _SURE, 1.0 - _SURE))
     gain = jnp.where(success, jnp.log(sure / usual), jnp.log((1.0 - sure) / (1.0 - usual)))
-    row = jax.nn.one_hot(which, 2)
+    row = jax.nn.one_hot(deployed, 3)
     return Trust(trust.log_odds + gain, trust.won + row * success, trust.lost + row * ~success)
 
 
+def faded(trust: Trust) -> Trust:
+    """After a learning phase."""
+    share = jnp.ones(3).at[LEARNED].set(_FADE)
+    return trust._replace(won=share * trust.won, lost=share * trust.lost)
+
+
 def expected(trust: Trust, promised: Array) -> Array:
-    """[2] the success to expect of the prior and of what is chosen. promised: [2] by the simulator."""
-    right = jax.nn.sigmoid(trust.log_odds)
-    return right * promised + (1.0 - right) * _records(trust)
+    """[3] the success to expect of the policies. promised: [3] by the simulator, nan where it has not tried one."""
+    right, records = jnp.minimum(jax.nn.sigmoid(trust.log_odds), _MOST), _records(trust)
+    return jnp.where(jnp.isnan(promised), records, right * promised + (1.0 - right) * records)
 
 
-def deploys(trust: Trust, promised: Array) -> Array:
-    """[] bool: whether to deploy what is chosen instead of the prior. promised: [2] as of `expected`."""
-    prior, chosen = expected(trust, promised)
-    return chosen > prior + _CLEARLY
+def choice(trust: Trust, promised: Array) -> Array:
+    """[] which policy to deploy. promised: [3] as of `expected`; nan for one that there is not."""
+    known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised))
+    base = jnp.where(known[CORRECTED] > known[AS_IS] + _CLEARLY, CORRECTED, AS_IS)
+    return jnp.where(known[LEARNED] > _TIMES * known[base], LEARNED, base)
 
 
 def _records(trust: Trust) -> Array:
-    """[2] by real rollouts alone."""
-    return trust.won / (trust.won + trust.lost)
+    """[3] by real rollouts alone."""
+    won, lost = trust.won[:LEARNED] + jnp.array(_WON), trust.lost[:LEARNED] + jnp.array(_LOST)
+    fixed, learned = won / (won + lost), _CREDIT * (1.0 + jnp.max(won / (won + lost))) / 2.0
+    of_learned = (trust.won[LEARNED] + learned) / (trust.won[LEARNED] + trust.lost[LEARNED] + _CREDIT)
+    return jnp.append(fixed, of_learned)

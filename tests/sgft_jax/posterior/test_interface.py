@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+import untrained
 
 from envs import gaps
 from envs.rollout import real_worlds
@@ -14,15 +15,15 @@ from sgft_jax.data.replay import blank
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io import priors
 from sgft_jax.io.priors import load_prior, load_priors, save_prior
-from sgft_jax.learners.sac import SACParams
+from sgft_jax.learners.sac import SACConfig
 from sgft_jax.methods import get_method
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.models.networks import make_actor
 from sgft_jax.posterior import estimator
 from sgft_jax.posterior.interface import entry_of
+from sgft_jax.posterior.trust import AS_IS, CORRECTED, LEARNED
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
-from sgft_jax.types import Normalizer, Prior, UserError
+from sgft_jax.types import Batch, Normalizer, Prior, SimulatedData, UserError
 
 TOY = toy.make()
 NET = NetworkConfig(hidden=(8,))
@@ -41,11 +42,11 @@ def small_estimator():
 
 @functools.cache
 def prior(known=True):
-    actor = make_actor(4, 2, NET).init(jax.random.key(1))
-    still = Normalizer(jnp.zeros(4), jnp.ones(4))
-    params = SACParams(actor, None, None, None, still, estimator=small_estimator() if known else None)
+    params = untrained.sac_params(SACConfig(4, 2, network=NET, ensemble_size=2), jax.random.key(1))
+    still, learned = Normalizer(jnp.zeros(4), jnp.ones(4)), small_estimator() if known else None
     card = {"task": "toy", "obs_dim": 4, "act_dim": 2, "gamma": 0.9, "algorithm": "sac", "network": jsonable(NET)}
-    return Prior(params, card | ({"estimator": entry_of(TOY)} if known else {}))
+    card |= {"estimator": entry_of(TOY)} if known else {}
+    return Prior(params._replace(normalizer=still, estimator=learned), card)
 
 
 def build(known=True, task=TOY, card=None, **options):
@@ -61,28 +62,56 @@ def real(**effects):
 
 @pytest.mark.heavy
 def test_every_rollout_is_remembered_and_chooses_anew():
-    fine, seeds = build(), jnp.array([0, 1], jnp.uint32)
+    fine, seeds = build(learns=False), jnp.array([0, 1], jnp.uint32)
     start = jax.tree.map(lambda x: x[None], prior().params)
     states = list(finetuning.finetune(fine, real(action_scale=0.7), start, seeds, rollouts=2))
     progress, metrics = states[-1]
-    known = progress.agent.interface
+    known, which = progress.agent.agent.interface, progress.agent.which
     assert (
         known.count.tolist() == [2, 2] and known.rollouts.valid[:, :2].all() and not known.rollouts.valid[:, 2:].any()
     )
-    for name in ("prior", "chosen"):
+    for name in ("as_is", "corrected"):
         assert ((metrics[f"posterior/{name}"] >= 0) & (metrics[f"posterior/{name}"] <= 1)).all()
-    assert not known.distortion.bias[~known.deployed].any(), "the prior as it is corrects nothing"
+    assert jnp.isnan(known.promised[:, LEARNED]).all() and (which != LEARNED).all()
+    assert not known.distortion.bias[which == AS_IS].any(), "the prior as it is corrects nothing"
     exported = jax.vmap(fine.export)(progress.agent)
     assert exported.estimator is None and jax.tree.map(jnp.array_equal, exported.distortion, known.distortion)
     np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"][0], prior().params.actor["Dense_0"]["kernel"])
 
 
+def rows(key, n):
+    """Of a system that pays for nothing."""
+    obs, action = jax.random.normal(key, (n, 4)), jax.random.uniform(key, (n, 2), minval=-1.0)
+    return blank(4, 2)._replace(
+        obs=obs, action=action, reward=jnp.zeros(n), discount=jnp.full(n, 0.9), next_obs=obs + 0.1
+    )
+
+
+@pytest.mark.heavy
+def test_what_learned_is_deployed_where_the_others_fail():
+    """And acts behind the correction, as it learned."""
+    fine, key = build(learns=True, utd=1.0, batch_size=8, actor_ramp=0, critic_warmup=0, lr_warmup=0), jax.random.key(0)
+    data = SimulatedData(lambda key, n: Batch(*rows(key, n)), jnp.zeros(1))
+    state = fine.prepare(fine.init(prior().params, key), data)
+    first = fine.export(state)
+    state = jax.jit(fine.observe)(state, rows(key, 20), jnp.ones(20, bool), jnp.float32(0))
+    lost = state._replace(trust=state.trust._replace(lost=jnp.array([9.0, 9.0, 0.0]), log_odds=jnp.float32(-9)))
+    after, metrics = jax.jit(lambda state: fine.learn(state, key, 20, data))(lost)
+    assert metrics["posterior/deployed"] == LEARNED and 0 <= metrics["posterior/learned"] <= 1
+    exported, changed = fine.export(after), after.agent.learner.actor.params["Dense_0"]["kernel"]
+    np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"], changed)
+    assert not jnp.array_equal(changed, first.actor["Dense_0"]["kernel"])
+    for which in (AS_IS, CORRECTED):
+        exported = fine.export(after._replace(which=jnp.int32(which)))
+        np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"], first.actor["Dense_0"]["kernel"])
+
+
 def test_a_log_without_success_chooses_nothing():
     fine = build()
     state = fine.init(prior().params, jax.random.key(0))
-    rows = jax.tree.map(lambda x: jnp.zeros((20, *x.shape), x.dtype), blank(4, 2))
-    after = fine.observe(state, rows, jnp.ones(20, bool), None)
-    assert after.interface.count == 0 and jnp.isnan(after.interface.promised).all()
+    after = fine.observe(state, rows(jax.random.key(0), 20), jnp.ones(20, bool), None)
+    assert after.agent.interface.count == 0 and jnp.isnan(after.agent.interface.promised).all()
+    assert after.trust.log_odds == state.trust.log_odds
 
 
 @pytest.mark.parametrize(

@@ -7,80 +7,119 @@ import jax.numpy as jnp
 import pytest
 
 from sgft_jax.posterior import trust
+from sgft_jax.posterior.trust import AS_IS, CORRECTED, LEARNED
 
 RUNS, ROLLOUTS = 10_000, 20
+NOTHING = jnp.full(3, jnp.nan)
 
 
-@functools.partial(jax.jit, static_argnames="runs")
-def fates(bias, std, *, runs=RUNS):
-    """Success [runs] of the prior and of what is chosen, and [runs, rollouts] of what is deployed.
+@functools.partial(jax.jit, static_argnames="learns")
+def fates(bias, std, *, learns):
+    """Success [runs, 3] of the policies, and [runs, rollouts] of what is deployed.
 
-    Success rates are uniform. bias: [2] of the simulator's promises for them. std: of further errors, which stay the
+    Success rates are uniform. bias: [3] of the simulator's promises for them. std: of further errors, which stay the
     same over a run; promises differ a little from rollout to rollout.
     """
 
     def run(key):
-        key_true, key_error, key_first, key_steps = jax.random.split(key, 4)
-        true = jax.random.uniform(key_true, (2,))
-        wrong = bias + std * jax.random.normal(key_error, (2,))
+        key_true, key_error, key_steps = jax.random.split(key, 3)
+        true = jax.random.uniform(key_true, (3,))
+        wrong = bias + std * jax.random.normal(key_error, (3,))
 
-        def step(known, key):
+        def step(carry, key):
+            known, which, promised = carry
             key_promise, key_play = jax.random.split(key)
-            promised = jnp.clip(true + wrong + 0.03 * jax.random.normal(key_promise, (2,)), 0.0, 1.0)
-            chosen = trust.deploys(known, promised)
-            which = chosen.astype(jnp.int32)
             success = jax.random.bernoulli(key_play, true[which])
-            return trust.told(known, chosen, promised[which], success), true[which]
+            known = trust.faded(trust.told(known, which, promised, success))
+            promised = jnp.clip(true + wrong + 0.03 * jax.random.normal(key_promise, (3,)), 0.0, 1.0)
+            promised = promised if learns else promised.at[LEARNED].set(jnp.nan)
+            which = trust.choice(known, promised)
+            return (known, which, promised), true[which]
 
-        begun = trust.told(trust.begin(), False, jnp.float32(jnp.nan), jax.random.bernoulli(key_first, true[0]))
-        _, played = jax.lax.scan(step, begun, jax.random.split(key_steps, ROLLOUTS))
-        return *true, played
+        start = trust.begin(), jnp.int32(AS_IS), NOTHING
+        return true, jax.lax.scan(step, start, jax.random.split(key_steps, ROLLOUTS))[1]
 
-    return jax.vmap(run)(jax.random.split(jax.random.key(0), runs))
+    return jax.vmap(run)(jax.random.split(jax.random.key(0), RUNS))
 
 
-# bias for the prior and for what is chosen, std; then at most: runs that are 20 points below the prior at the end, at
-# any time; at least: share of the possible gain, over all rollouts
+# what learns is tried; bias for the prior as it is, behind a correction, and for what learns, std; then at most: runs
+# that are 20 points below the prior at the end, at any time; at least: share of the possible gain, over all rollouts
 CASES = [
-    ((0.0, 0.0), 0.0, 0.001, 0.005, 0.95),
-    ((0.0, 0.0), 0.1, 0.005, 0.015, 0.90),
-    ((0.0, 0.0), 0.3, 0.02, 0.065, 0.74),
-    ((0.3, 0.3), 0.1, 0.005, 0.035, 0.77),
-    ((-0.3, -0.3), 0.1, 0.005, 0.01, 0.89),
-    ((0.0, 0.3), 0.0, 0.02, 0.095, 0.80),
-    ((0.0, 0.3), 0.3, 0.025, 0.125, 0.74),
-    ((0.0, -0.3), 0.1, 0.005, 0.01, 0.72),
+    (False, (0.0, 0.0, 0.0), 0.0, 0.001, 0.005, 0.95),
+    (False, (0.0, 0.0, 0.0), 0.1, 0.005, 0.015, 0.90),
+    (False, (0.0, 0.0, 0.0), 0.3, 0.02, 0.065, 0.74),
+    (False, (0.3, 0.3, 0.0), 0.1, 0.005, 0.035, 0.77),
+    (False, (-0.3, -0.3, 0.0), 0.1, 0.005, 0.01, 0.89),
+    (False, (0.0, 0.3, 0.0), 0.0, 0.02, 0.095, 0.80),
+    (False, (0.0, 0.3, 0.0), 0.3, 0.025, 0.125, 0.74),
+    (False, (0.0, -0.3, 0.0), 0.1, 0.005, 0.01, 0.72),
+    (True, (0.0, 0.0, 0.0), 0.0, 0.002, 0.012, 0.95),
+    (True, (0.0, 0.0, 0.0), 0.1, 0.005, 0.03, 0.90),
+    (True, (0.0, 0.0, 0.0), 0.3, 0.025, 0.125, 0.74),
+    (True, (0.3, 0.3, 0.3), 0.1, 0.015, 0.13, 0.77),
+    (True, (-0.3, -0.3, -0.3), 0.1, 0.01, 0.07, 0.88),
+    (True, (0.0, 0.0, 0.3), 0.3, 0.025, 0.16, 0.72),
+    (True, (0.0, 0.3, 0.3), 0.3, 0.03, 0.2, 0.72),
+    (True, (-0.6, -0.6, -0.6), 0.1, 0.015, 0.15, 0.78),
 ]
 
 
-@pytest.mark.parametrize(("bias", "std", "end", "ever", "gain"), CASES)
-def test_falls_are_rare_and_gains_are_kept(bias, std, end, ever, gain):
-    prior, chosen, played = fates(jnp.array(bias), std)
+@pytest.mark.parametrize(("learns", "bias", "std", "end", "ever", "gain"), CASES)
+def test_falls_are_rare_and_gains_are_kept(learns, bias, std, end, ever, gain):
+    true, played = fates(jnp.array(bias), std, learns=learns)
+    prior, best = true[:, AS_IS], true[:, : 2 + learns].max(axis=1)
     fell = prior[:, None] - played > 0.2
     assert fell[:, -1].mean() <= end and fell.any(axis=1).mean() <= ever
-    possible = jnp.maximum(chosen - prior, 0.0)
-    assert (played.mean(axis=1) - prior).mean() / possible.mean() >= gain
+    assert (played.mean(axis=1) - prior).mean() / (best - prior).mean() >= gain
+
+
+def after(*rollouts, promised=NOTHING):
+    """(policy, success) of rollouts that were promised so much."""
+    known = trust.begin()
+    for which, success in rollouts:
+        known = trust.told(known, which, promised, success)
+    return known
 
 
 def test_one_failure_brings_a_good_prior_back():
     """The simulator thinks little of a prior that succeeds, and promises much for what fails."""
-    known = trust.told(trust.begin(), False, jnp.float32(jnp.nan), True)
-    promised = jnp.array([0.5, 0.95])
-    assert trust.deploys(known, promised)
-    assert not trust.deploys(trust.told(known, True, promised[1], False), promised)
+    promised = jnp.array([0.5, 0.95, jnp.nan])
+    known = after((AS_IS, True))
+    assert trust.choice(known, promised) == CORRECTED
+    assert trust.choice(trust.told(known, CORRECTED, promised, False), promised) == AS_IS
 
 
 def test_a_promise_that_is_kept_is_trusted_more():
-    known, promised = trust.begin(), jnp.array([0.1, 0.9])
-    kept = trust.told(known, True, promised[1], True)
-    assert kept.log_odds > known.log_odds and trust.expected(kept, promised)[1] > trust.expected(known, promised)[1]
+    known, promised = trust.begin(), jnp.array([0.1, 0.9, jnp.nan])
+    kept = trust.told(known, CORRECTED, promised, True)
+    assert kept.log_odds > known.log_odds
+    assert trust.expected(kept, promised)[CORRECTED] > trust.expected(known, promised)[CORRECTED]
 
 
 def test_without_a_promise_only_the_record_changes():
-    known = trust.told(trust.begin(), False, jnp.float32(jnp.nan), True)
+    known = after((AS_IS, True))
     assert known.log_odds == trust.begin().log_odds
-    assert known.won.tolist() == [2.0, 0.5] and known.lost.tolist() == [0.5, 1.0]
+    assert known.won.tolist() == [1, 0, 0] and known.lost.tolist() == [0, 0, 0]
 
 
-def test_equal_promises_leave_the_prior():
-    assert not trust.deploys(trust.begin(), jnp.array([0.8, 0.8]))
+@pytest.mark.parametrize("learned", [0.8, jnp.nan])
+def test_equal_promises_leave_the_prior(learned):
+    assert trust.choice(trust.begin(), jnp.array([0.8, 0.8, learned])) == AS_IS
+
+
+def test_what_learns_is_tried_where_the_others_fail_as_promised():
+    """No system of the simulator does what the real one does, and in none of them works what works there."""
+    promised = jnp.array([0.05, 0.05, 0.03])
+    assert trust.choice(after((AS_IS, False), (AS_IS, False), promised=promised), promised) == LEARNED
+
+
+def test_simulation_vetoes_what_learns_while_its_promises_are_kept():
+    promised = jnp.array([0.3, 0.9, 0.4])
+    known = after((AS_IS, False), (CORRECTED, True), (CORRECTED, False), (CORRECTED, True), promised=promised)
+    assert trust.choice(known, promised) == CORRECTED
+
+
+def test_old_rollouts_of_what_learns_count_less():
+    known = after((LEARNED, True), (AS_IS, True))
+    aged = trust.faded(known)
+    assert aged.won[LEARNED] < known.won[LEARNED] and aged.won[AS_IS] == known.won[AS_IS]
