@@ -100,7 +100,8 @@ def deployed(inner: Finetuner, env: Env, systems: Candidates, policy: Policy, *,
         return member(stack([state.first, corrected, inner.export(state.agent)]), state.which)
 
     def act(state: Deployed, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
-        return policy.act(export(state), carry, obs, key, explore=explore)
+        # Only what learns explores: the others are promised as they are.
+        return policy.act(export(state), carry, obs, key, explore=explore & (state.which == LEARNED))
 
     def observe(state: Deployed, rows: Transition, valid: Array, score: Array | None) -> Deployed:
         if score is None:  # none of the policies has played

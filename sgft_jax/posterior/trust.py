@@ -19,9 +19,10 @@ from envs.types import Array
 AS_IS, CORRECTED, LEARNED = range(3)
 
 _RIGHT, _MOST = 0.8, 0.9  # probability that a simulator is right, before any rollout and at most
-_SURE = 0.05  # no promise is surer than this of success or failure
-_WON, _LOST = (1.0, 0.5), (0.5, 1.0)  # imagined rollouts of the prior as it is and behind a correction
-_CREDIT = 1.0  # imagined rollouts of what learns, half way between the better of these and success
+_SURE = 0.15  # no promise is surer than this of success or failure
+_WON, _LOST = 1.0, 0.5  # imagined rollouts of the prior as it is
+_DOUBT, _HALF = 1.5, 0.5  # imagined rollouts behind a correction of a wrong simulator, half as good as these
+_CREDIT = 1.0  # imagined rollouts of what learns, half way between the better of the two and success
 _CLEARLY, _TIMES = 0.02, 1.2  # a correction must be better by so much, what learns so many times as good
 _FADE = 0.9  # what learns has changed: so many times its rollouts count
 
@@ -72,7 +73,12 @@ def choice(trust: Trust, promised: Array) -> Array:
 
 def _records(trust: Trust) -> Array:
     """[3] by real rollouts alone."""
-    won, lost = trust.won[:LEARNED] + jnp.array(_WON), trust.lost[:LEARNED] + jnp.array(_LOST)
-    fixed, learned = won / (won + lost), _CREDIT * (1.0 + jnp.max(won / (won + lost))) / 2.0
-    of_learned = (trust.won[LEARNED] + learned) / (trust.won[LEARNED] + trust.lost[LEARNED] + _CREDIT)
-    return jnp.append(fixed, of_learned)
+    as_is = (trust.won[AS_IS] + _WON) / (trust.won[AS_IS] + trust.lost[AS_IS] + _WON + _LOST)
+    corrected = _mean(trust, CORRECTED, _HALF * as_is, _DOUBT)
+    learned = _mean(trust, LEARNED, (1.0 + jnp.maximum(as_is, corrected)) / 2.0, _CREDIT)
+    return jnp.stack([as_is, corrected, learned])
+
+
+def _mean(trust: Trust, which: int, usual: Array, weight: float) -> Array:
+    """[] of a policy's rollouts and of so many imagined ones, usual: [] as successful as that."""
+    return (trust.won[which] + weight * usual) / (trust.won[which] + trust.lost[which] + weight)
