@@ -24,6 +24,7 @@ _WON, _LOST = 1.0, 0.5  # imagined rollouts of the prior as it is
 _DOUBT, _HALF = 1.5, 0.5  # imagined rollouts behind a correction of a wrong simulator, half as good as these
 _CREDIT = 1.0  # imagined rollouts of what learns, half way between the better of the two and success
 _CLEARLY, _TIMES = 0.02, 1.2  # a correction must be better by so much, what learns so many times as good
+_WORKS = 0.5  # a correction must promise so much: where none works in any system, none of them is the real one
 _FADE = 0.9  # what learns has changed: so many times its rollouts count
 
 
@@ -67,7 +68,8 @@ def expected(trust: Trust, promised: Array) -> Array:
 def choice(trust: Trust, promised: Array) -> Array:
     """[] which policy to deploy. promised: [3] as of `expected`; nan for one that there is not."""
     known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised))
-    base = jnp.where(known[CORRECTED] > known[AS_IS] + _CLEARLY, CORRECTED, AS_IS)
+    helps = (known[CORRECTED] > known[AS_IS] + _CLEARLY) & (promised[CORRECTED] >= _WORKS)
+    base = jnp.where(helps, CORRECTED, AS_IS)
     return jnp.where(known[LEARNED] > _TIMES * known[base], LEARNED, base)
 
 
