@@ -45,6 +45,11 @@ class Entry(NamedTuple):
     size: int
     error: float = 0.0
 
+    @property
+    def labels(self) -> list[str]:
+        """What its numbers are called."""
+        return [f"{self.name}[{i}]" for i in range(self.size)] if self.size > 1 else [self.name]
+
 
 class Parameter(NamedTuple):
     """One domain parameter: its nominal value and the uniform range [low, high] that pretraining draws it from.

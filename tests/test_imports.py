@@ -31,7 +31,7 @@ MISTAKES = {
     "pretrain": "--config.gamma 2",
     "finetune": "--method sgft-sca",
     "evaluate": "--task hamer",
-    "demo": "--seeds 0",
+    "demo": "--rollouts 0",
     "compare": "--methods sac sac",
     "compare hybrid": "--methods sac foo --reference sac",
     "gaps": "--episodes 3",

@@ -10,7 +10,7 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Entry, Env
+from envs.base import Env
 from envs.gaps import SIM, Gap
 from envs.rollout import Episode
 from envs.types import Transition, UserError
@@ -121,14 +121,9 @@ def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior
 
 def names_of(env: Env) -> Names:
     """What people call the numbers of a task."""
-    action, sensors = ([label for e in entries for label in _labels(e)] for entries in (env.action, env.measured))
+    action, sensors = ([label for e in entries for label in e.labels] for entries in (env.action, env.measured))
     units = [e.unit for e in env.measured for _ in range(e.size)]
     return Names(action, list(zip(sensors, units, strict=True)), env.sensor_errors, env.control_dt, FURTHEST)
-
-
-def _labels(entry: Entry) -> list[str]:
-    """What the numbers of an entry are called."""
-    return [f"{entry.name}[{i}]" for i in range(entry.size)] if entry.size > 1 else [entry.name]
 
 
 def average(diagnoses: Sequence[Mapping[str, Any]], *, same: bool) -> dict[str, Any]:

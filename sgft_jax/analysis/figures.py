@@ -286,6 +286,24 @@ def effects(path: Path, intervals: Mapping[str, Mapping[str, Mapping[str, Interv
     return _save(figure, path, "effect of each part, mean over all others")
 
 
+def shrinking(path: Path, names: Sequence[str], truth: np.ndarray, intervals: np.ndarray, *, title: str) -> Path:
+    """How intervals shrink around the truth: a panel for each unknown, a bar for each number of rollouts.
+
+    truth: [k]. intervals: [n + 1, k, 2], the first before any rollout.
+    """
+    columns = min(len(names), 3)
+    figure, panels = _figure(3.4 * columns, 1.6 * math.ceil(len(names) / columns) + 0.6, columns, len(names))
+    heights = np.arange(len(intervals))
+    for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
+        axes.hlines(heights, *intervals[:, i].T, color=[_FAINT, *[PALETTE[0]] * (len(heights) - 1)], linewidth=5)
+        axes.axvline(truth[i], color=PALETTE[1], linewidth=1.5)
+        axes.set_yticks(heights, [f"{n} rollouts" if n != 1 else "1 rollout" for n in heights])
+        axes.set_ylim(len(heights) - 0.5, -0.5)
+        axes.tick_params(labelleft=i % columns == 0)
+        _name(axes, name)
+    return _save(figure, path, title)
+
+
 def _name(axes: Axes, title: str, x: str = "") -> None:
     """What a panel shows, and what its x axis is."""
     axes.set_title(title, **_FONT, loc="left")

@@ -1,103 +1,72 @@
-"""The demo from a prior to the table, on a point mass."""
+"""The demo from a prior to its tables, on a point mass."""
 
+import re
 from pathlib import Path
-from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import pytest
-from priors_by_hand import save_prior
-from runs_by_hand import save
+import toy
+import untrained
 
 import envs
 from envs.types import UserError
 from experiments import demo
-from sgft_jax.analysis.reading import read_runs
+from experiments.runner import narrowed
+from sgft_jax.files.disk import jsonable
+from sgft_jax.io.priors import save_prior
+from sgft_jax.learners.sac import SACConfig
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.posterior import decision, estimator, interface
+from sgft_jax.types import Normalizer, Prior
+
+NET = NetworkConfig(hidden=(8,))
 
 
-class Beside:
-    """A process that does its work when it is waited for; a real one would not know the point mass."""
-
-    exitcode = 0
-
-    def __init__(self, target, args, daemon):
-        assert daemon  # it must not outlive the demo
-        self.work = lambda: target(*args)
-
-    def start(self):
-        pass
-
-    def join(self):
-        self.work()
-
-    def kill(self):
-        pass
-
-
-class Failed(Beside):
-    exitcode = 1
-
-    def join(self):
-        pass
-
-
-def beside(monkeypatch, process):
-    monkeypatch.setattr(demo.multiprocessing, "get_context", lambda method: SimpleNamespace(Process=process))
+def prior():
+    """Of the point mass, with an estimator that has learned nothing."""
+    env = toy.make()
+    entry = interface.entry_of(env)
+    zeros = estimator.shaped(entry["steps"], entry["measured"], env.act_dim, len(entry["unknowns"]))
+    unlearned = zeros._replace(statistics=estimator.Statistics(jnp.zeros(4), jnp.ones(4), jnp.ones(4)))
+    params = untrained.sac_params(SACConfig(4, 2, network=NET, ensemble_size=2), jax.random.key(1))
+    card = {"task": "toy", "obs_dim": 4, "act_dim": 2, "gamma": 0.9, "algorithm": "sac", "network": jsonable(NET)}
+    still = Normalizer(jnp.zeros(4), jnp.ones(4))
+    return Prior(params._replace(normalizer=still, estimator=unlearned), card | {"estimator": entry})
 
 
 @pytest.mark.slow
-def test_demo_compares_its_methods_from_one_prior(tmp_path, monkeypatch, capsys):
-    beside(monkeypatch, Beside)
+def test_the_demo_tells_what_rollouts_say_of_the_system(tmp_path, monkeypatch, capsys):
+    for module in (decision, interface):
+        for name, value in {"CANDIDATES": 2, "JUDGES": 2}.items():
+            monkeypatch.setattr(module, name, value)
     monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(narrowed, "_SHOWN", 20)  # all: the estimator tells nothing of any
     gap = tmp_path / "turned.toml"
     gap.write_text("[params]\nmass = 2.0\n[effects]\naction_rotation = 0.52\n")
-    out, prior = tmp_path / "demo", tmp_path / "prior"
-    save_prior(prior, 0)
-    demo.main(demo.DemoArgs(task="toy", prior=prior, real=str(gap), seeds=2, rollouts=3, video=False, out=out))
-    printed = capsys.readouterr().out
-    table = [line for line in printed.splitlines() if line.startswith("|")]
-    assert set(demo.METHODS) <= {line.split("|")[1].strip() for line in table}
-    for method in demo.METHODS:
-        run = out / "finetune" / "toy" / "turned" / method / "seeds-0-1"
-        assert (run / "summary.json").exists() and len(list((run / "real").glob("*.npz"))) == 3
-    assert "rollouts" in (out / "beside.log").read_text()
-    assert "Those that did best in the real rollouts: sgft-mpc " in printed
+    save_prior(tmp_path / "prior", prior())
+    demo.main(demo.DemoArgs("toy", tmp_path / "prior", str(gap), video=False, out=tmp_path / "demo"))
+    tables = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    (turned,) = [row for row in tables if "rotation of commands, rad" in row[0]]
+    assert len(turned) == 5 and turned[-1].startswith("0.52")
+    low, high = map(float, turned[1].split(" to "))
+    assert -0.85 < low < -0.75 and 0.75 < high < 0.85  # 80 % of what it may be
+    rollouts = [row for row in tables if re.match(r"\| \d", row[0])]
+    assert [row[0] for row in rollouts] == ["| 0", "| 1", "| 2"] and rollouts[0][1] == "the prior as it is"
+    assert all(row[3].endswith("% |") for row in rollouts) and list((tmp_path / "demo").rglob("posterior.png"))
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"seeds": 0}, "--seeds is 0: must be at least 1"),
         ({"rollouts": 0}, "--rollouts is 0: must be at least 1"),
-        ({"task": "insrt"}, "there is no 'insrt', did you mean 'insert'"),
-        ({"real": "hrd"}, "gap of insert: there is no 'hrd', did you mean 'hard'"),
+        ({"task": "psh"}, "there is no 'psh', did you mean 'push'"),
+        ({"real": "hrd"}, "gap of push: there is no 'hrd', did you mean 'hard'"),
         ({"prior": Path("nowhere")}, "--prior nowhere: no such folder"),
     ],
 )
-def test_mistakes_are_found_before_anything_is_trained(tmp_path, monkeypatch, options, words):
-    monkeypatch.setattr(demo, "finetune", lambda args: pytest.fail("trains"))
+def test_mistakes_are_found_before_anything_is_played(tmp_path, monkeypatch, options, words):
+    monkeypatch.setattr(demo, "finetune", lambda args: pytest.fail("plays"))
     with pytest.raises(UserError, match=words):
         demo.main(demo.DemoArgs(out=tmp_path, **options))
     assert not list(tmp_path.iterdir())
-
-
-def test_the_outcome_is_said_in_a_few_lines(tmp_path):
-    for method, end in (("sgft-sac", 0.9), ("sac", 0.2)):
-        save(tmp_path, method, [[0.0, 0.0], [end, end]], rollouts=[0, 5])
-    save(tmp_path, "sgft-mpc", [[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]], rollouts=[0, 1, 5])  # learns from the first on
-    best = {"sgft-mpc": {"best": {"score": [0.75, 1.0]}}}
-    said = demo.outcome(read_runs(tmp_path).curves, best).splitlines()
-    assert said[2:7] == [
-        "| method | zero-shot | 1 rollout | 5 rollouts |",
-        "| --- | --- | --- | --- |",
-        "| sac | 0 | - | 20 |",
-        "| sgft-mpc | 0 | 50 | 100 |",
-        "| sgft-sac | 0 | - | 90 |",
-    ]
-    assert "did best in the real rollouts: sgft-mpc 88" in said[8]  # (75 + 100) / 2
-
-
-def test_a_failure_beside_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "finetune", lambda args: None)
-    beside(monkeypatch, Failed)
-    runs = [demo.FinetuneArgs(method=method, out=tmp_path) for method in demo.METHODS]
-    with pytest.raises(UserError, match=r"fine-tuning with sgft-sac or sac failed, see .*beside\.log"):
-        demo._finetune_all(*runs)

@@ -166,7 +166,7 @@ def test_the_phases_of_every_command():
     assert {path.stem: phases for path in files if (phases := announced(path))} == {
         "benchmark": {"measuring ...: ..."},
         "collect_run": {"compiling the training", "playing the episodes to record"},
-        "demo": {"waiting for ..."},
+        "demo": {"drawing from the posterior"},
         "diagnose_run": {"playing ... of each prior", "examining the rollouts"},
         "estimate": {"compiling the simulator and worlds of ..."},
         "estimating": {
