@@ -43,7 +43,6 @@ def test_a_prior_is_given_an_estimator_and_adapts(prior, tmp_path, monkeypatch, 
 
 def test_finetuning_says_how_an_estimator_is_made(tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
-        finetune.main(
-            ["--task", "panda-push", "--method", "posterior", "--prior", "shipped:panda-push", "--out", str(tmp_path)]
-        )
+        options = ["--task", "panda-push", "--method", "posterior", "--prior", "shipped:panda-push"]
+        finetune.main([*options, "--real", "stand-in", "--out", str(tmp_path)])
     assert stopped.value.code == 2 and "experiments.estimate" in capsys.readouterr().err

@@ -45,11 +45,8 @@ def test_copies_are_loaded_like_their_originals(tmp_path, capsys):
 @pytest.mark.heavy
 def test_the_priors_that_come_with_the_code_are_small_and_whole():
     folders = sorted((ROOT / "sgft_jax/priors").glob("*/seed-*"))
-    found = {
-        folder.parent.name: load_prior(folder, task=folder.parent.name.removesuffix("-cpu")).card["preset"]
-        for folder in folders
-    }
-    assert found == {"hammer": "robust", "insert": "robust", "insert-cpu": "cpu", "panda-push": "cpu", "push": "robust"}
+    found = {folder.parent.name: load_prior(folder, task=folder.parent.name).card["preset"] for folder in folders}
+    assert found == {"hammer": "robust", "insert": "robust", "panda-push": "cpu", "push": "robust"}
     assert sum(file.stat().st_size for file in (ROOT / "sgft_jax/priors").rglob("*") if file.is_file()) < 12e6
 
 

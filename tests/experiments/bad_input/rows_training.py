@@ -156,7 +156,7 @@ ROWS = [
     ("hybrid --method iql --task push --data set.hdf5 --successors sideways", "--successors: there is no 'sideways'"),
     ("demo --task nope", "task: there is no 'nope'"),
     ("demo --real nope", "gap of push: there is no 'nope'"),
-    ("demo --prior shipped:insert-cpu", "the prior is of the task 'insert', not of 'push'"),
+    ("demo --prior shipped:insert", "the prior is of the task 'insert', not of 'push'"),
     ("demo --rollouts 0", "--rollouts is 0: must be at least 1"),
     ("demo --rollouts 99999999999999999", "--rollouts is 99999999999999999: must be at most 2147483647"),
     ("demo --prior nowhere", "--prior nowhere: no such folder"),

@@ -143,12 +143,12 @@ def test_a_prior_keeps_its_estimator_on_disk(tmp_path):
 def test_only_an_estimator_is_of_half_precision(tmp_path, monkeypatch):
     """Files in other precisions, as no version writes them."""
     whole = Prior(prior().params._replace(actor=jax.tree.map(jnp.float16, prior().params.actor)), prior().card)
-    with pytest.raises(UserError, match="actor.* is not float32; take another prior"):
+    with pytest.raises(UserError, match=r"actor.* is not float32; take another prior"):
         load_prior(save_prior(tmp_path / "half", whole))
     monkeypatch.setattr(priors, "_ESTIMATOR", "float32")
     folder = save_prior(tmp_path / "whole", prior())
     monkeypatch.undo()
-    with pytest.raises(UserError, match="estimator.* is not float16; take another prior"):
+    with pytest.raises(UserError, match=r"estimator.* is not float16; take another prior"):
         load_prior(folder)
 
 
