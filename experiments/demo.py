@@ -31,8 +31,8 @@ class DemoArgs:
     rollouts: int = 2
     """Real rollouts."""
     seed: FirstSeed = 0
-    video: bool = True
-    """Render an episode before and after, where MuJoCo can render."""
+    video: bool = False
+    """Also render an episode before and after (half a minute), where MuJoCo can render."""
     out: Path = Path("runs/demo")
     """Folder of the demo; an earlier demo in it is replaced."""
 

@@ -61,7 +61,9 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interf
         if params.estimator is None:
             raise UserError("this prior has no estimator of systems; `python -m experiments.estimate` makes it")
         acting, judges = _acting(params), jnp.zeros((JUDGES, len(systems.unknowns)))
-        return Believed(acting, params.estimator, room, jnp.int32(0), judges, nothing, jnp.full(3, jnp.nan), key)
+        return Believed(
+            acting, params.estimator, room, jnp.int32(0), judges, nothing, jnp.full(3, jnp.nan, jnp.float32), key
+        )
 
     def refit(known: Believed, seen: Seen) -> Believed:
         if seen.rollout is None:  # of a log, which does not tell success

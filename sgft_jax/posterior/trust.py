@@ -9,6 +9,7 @@ neither veto nor promote; and what learns is tried where the others fail, whatev
 tests/sgft_jax/posterior/test_trust.py states the errors, for simulators of several biases.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -38,7 +39,7 @@ class Trust(NamedTuple):
 
 def begin() -> Trust:
     """Before any rollout."""
-    return Trust(jnp.log(_RIGHT / (1.0 - _RIGHT)), jnp.zeros(3), jnp.zeros(3))
+    return Trust(jnp.float32(math.log(_RIGHT / (1.0 - _RIGHT))), jnp.zeros(3), jnp.zeros(3))
 
 
 def told(trust: Trust, deployed: Array, promised: Array, success: Array) -> Trust:
@@ -70,7 +71,8 @@ def choice(trust: Trust, promised: Array) -> Array:
     known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised))
     helps = (known[CORRECTED] > known[AS_IS] + _CLEARLY) & (promised[CORRECTED] >= _WORKS)
     base = jnp.where(helps, CORRECTED, AS_IS)
-    return jnp.where(known[LEARNED] > _TIMES * known[base], LEARNED, base)
+    which = jnp.where(known[LEARNED] > _TIMES * known[base], LEARNED, base)
+    return which.astype(jnp.int32)
 
 
 def _records(trust: Trust) -> Array:

@@ -93,10 +93,12 @@ def test_what_learned_is_deployed_where_the_others_fail():
     fine, key = build(learns=True, utd=1.0, batch_size=8, actor_ramp=0, critic_warmup=0, lr_warmup=0), jax.random.key(0)
     data = SimulatedData(lambda key, n: Batch(*rows(key, n)), jnp.zeros(1))
     state = fine.prepare(fine.init(prior().params, key), data)
-    first = fine.export(state)
+    first, begun = fine.export(state), state
     state = jax.jit(fine.observe)(state, rows(key, 20), jnp.ones(20, bool), jnp.float32(0))
     lost = state._replace(trust=state.trust._replace(lost=jnp.array([9.0, 9.0, 0.0]), log_odds=jnp.float32(-9)))
     after, metrics = jax.jit(lambda state: fine.learn(state, key, 20, data))(lost)
+    kinds = [[jax.typeof(x) for x in jax.tree.leaves(y)] for y in (begun, after)]
+    assert kinds[0] == kinds[1], "another rollout would compile everything again"
     assert metrics["posterior/deployed"] == LEARNED and 0 <= metrics["posterior/learned"] <= 1
     exported, changed = fine.export(after), after.agent.learner.actor.params["Dense_0"]["kernel"]
     np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"], changed)
