@@ -7,9 +7,10 @@ from pathlib import Path
 from experiments.finetune import finetune
 from experiments.runner import cli
 from experiments.runner.finetune_args import FinetuneArgs, arguments, check, priors_of, run_folder
-from experiments.runner.options import FirstSeed, check_task
+from experiments.runner.options import FirstSeed, at_least_one, check_task
 from experiments.runner.progress import doing
 from sgft_jax.io.log import EVAL, METRICS, read_jsonl
+from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
 
 _METHOD = "posterior"
@@ -64,12 +65,15 @@ def main(args: DemoArgs) -> None:
 
 def plan(args: DemoArgs) -> FinetuneArgs:
     """What runs; raises UserError for all that is wrong with it before any of it does."""
-    check_task(args.task, [args.real])
+    # The default system's numbers are checked against the task, which takes JAX: everything else comes before.
+    check_task(args.task)
+    at_least_one(args, "rollouts")
+    check_folder(args.out)
     shared = {"task": args.task, "prior": args.prior, "out": args.out, "overwrite": True, "real": (args.real,)}
     size = {"seed": args.seed, "seeds": 1, "rollouts": args.rollouts, "eval_every": 1, "eval_episodes": 20}
     run = arguments(_METHOD, options=get_method(_METHOD).config(learns=False), video=args.video, **shared, **size)
-    check(run)
     priors_of(run)
+    check(run)
     return run
 
 
