@@ -47,7 +47,7 @@ test: $(PY) ## the fast tests, four minutes on two cores
 test-all: $(PY) ## every test that this machine can run
 	$(PY) -m pytest -q -n $(JOBS) --dist worksteal $(ARGS)
 
-demo: $(PY) ## a policy fails, SGFT mends it: two minutes on a CPU
+demo: $(PY) ## a policy fails, two rollouts mend it: two minutes on a CPU
 	$(PY) -m experiments.demo $(FLAGS)
 
 real-demo: $(PY) ## fine-tune in another engine, Bullet (needs a Python 3.11: PYTHON311=...)

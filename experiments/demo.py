@@ -50,7 +50,7 @@ def main(args: DemoArgs) -> None:
         unknowns = narrowed(run, home)
     path = figures.shrinking(home / "figures" / "posterior.png", *unknowns, title="Which system is it?")
     names, truth, intervals = unknowns
-    after = [f"{n} rollouts" for n in range(len(intervals))]
+    after = [f"{n} rollout{'s' * (n != 1)}" for n in range(len(intervals))]
     rows = [
         [name, *(f"{low:.3g} to {high:.3g}" for low, high in intervals[:, i]), f"{truth[i]:.3g}"]
         for i, name in enumerate(names)
