@@ -15,7 +15,6 @@ from sgft_jax.methods import get_method
 
 _METHOD = "posterior"
 _GAP = Path(__file__).parents[1] / "envs/gaps/development/push-drawn.toml"
-_ARMS = ("as_is", "corrected", "learned")
 
 
 @dataclass(frozen=True)
@@ -79,12 +78,14 @@ def plan(args: DemoArgs) -> FinetuneArgs:
 
 def outcome(home: Path) -> list[list[str]]:
     """After each number of rollouts what is deployed, the success that is promised for it, and its success."""
+    from sgft_jax.posterior.trust import POLICIES
+
     scores = {int(record["rollouts"]): record["score"][0] for record in read_jsonl(home / EVAL)}
     lines = [["0", "the prior as it is", "", f"{100 * scores[0]:.0f} %"]]
     for record in read_jsonl(home / METRICS):
-        arm, n = _ARMS[int(record["posterior/deployed"][0])], int(record["rollouts"])
-        promised = f"{100 * record[f'posterior/{arm}'][0]:.0f} %"
-        lines.append([str(n), f"the prior {arm.replace('_', ' ')}", promised, f"{100 * scores[n]:.0f} %"])
+        policy, n = POLICIES[int(record["posterior/deployed"][0])], int(record["rollouts"])
+        promised = f"{100 * record[f'posterior/{policy}'][0]:.0f} %"
+        lines.append([str(n), f"the prior {policy.replace('_', ' ')}", promised, f"{100 * scores[n]:.0f} %"])
     return lines
 
 

@@ -14,6 +14,7 @@ from envs import gaps
 from envs.base import Env
 from envs.mujoco.worlds import choose_impl
 from envs.types import Array, Key
+from experiments.runner.diagnose_run import names_of
 from experiments.runner.finetune_args import FinetuneArgs, priors_of
 from experiments.runner.options import episodes_of
 from sgft_jax.io.priors import load_prior, observed
@@ -98,10 +99,10 @@ def _label(env: Env, unknown: Unknown) -> tuple[str, float]:
     """An unknown with its unit, for people, and what its numbers are multiplied by."""
     words = _WORDS.get(unknown.name, unknown.name.replace("_", " "))
     units = {p.name: p.unit for p in env.parameters} | {"action_rotation": "rad", "latency": "s"}
-    unit, scale = units.get(unknown.name, ""), 1.0
-    if unknown.name in ("action_scale", "action_bias", "obs_bias"):
-        entries = env.measured if unknown.name == "obs_bias" else env.action
-        label, unit = [(label, e.unit) for e in entries for label in e.labels][unknown.index]
-        unit, scale = ("mm", 1000.0) if unit == "m" and unknown.name == "obs_bias" else (unit, 1.0)
-        words, unit = f"{words} {label}", unit if unknown.name == "obs_bias" else ""
+    unit, scale, names = units.get(unknown.name, ""), 1.0, names_of(env)
+    if unknown.name in ("action_scale", "action_bias"):
+        words = f"{words} {names.action[unknown.index]}"
+    elif unknown.name == "obs_bias":
+        label, unit = names.sensors[unknown.index]
+        words, unit, scale = f"{words} {label}", *(("mm", 1000.0) if unit == "m" else (unit, 1.0))
     return f"{words}, {unit}" if unit else words, scale

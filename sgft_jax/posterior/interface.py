@@ -17,7 +17,7 @@ from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, judged
 from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
-from sgft_jax.posterior.trust import AS_IS, CORRECTED, LEARNED, Trust, begin, choice, expected, faded, told
+from sgft_jax.posterior.trust import AS_IS, CORRECTED, LEARNED, POLICIES, Trust, begin, choice, expected, faded, told
 from sgft_jax.stacking import member, stack
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
 
@@ -113,7 +113,7 @@ def deployed(inner: Finetuner, env: Env, systems: Candidates, policy: Policy, *,
         # What learns acts behind the correction too, unless the prior as it is is expected to do better without.
         which, known = choice(trust, agent.interface.promised), agent.interface
         distortion = jax.tree.map(lambda a, b: jnp.where(which == CORRECTED, a, b), known.distortion, nothing)
-        return Deployed(_believing(agent, known._replace(distortion=distortion)), state.first, trust, which)
+        return Deployed(agent._replace(interface=known._replace(distortion=distortion)), state.first, trust, which)
 
     def learn(
         state: Deployed,
@@ -133,10 +133,9 @@ def deployed(inner: Finetuner, env: Env, systems: Candidates, policy: Policy, *,
             promise = judged(env, systems, policy, acting, known.judges, key_choice)
             known = known._replace(promised=known.promised.at[LEARNED].set(promise))
         which = choice(trust, known.promised)
-        names = ("as_is", "corrected", "learned")
-        metrics |= {f"posterior/{n}": x for n, x in zip(names, expected(trust, known.promised), strict=True)}
+        metrics |= {f"posterior/{n}": x for n, x in zip(POLICIES, expected(trust, known.promised), strict=True)}
         metrics |= {"posterior/deployed": which.astype(jnp.float32)}
-        return Deployed(_believing(agent, known), state.first, trust, which), metrics
+        return Deployed(agent._replace(interface=known), state.first, trust, which), metrics
 
     changed = {"init": init, "prepare": prepare, "act": act, "observe": observe, "learn": learn, "export": export}
     return inner._replace(init_carry=policy.init_carry, guarded=True, estimates=True, **changed)
@@ -158,7 +157,3 @@ def _acting(params: PyTree) -> PyTree:
 def _keys(known: Believed) -> Array:
     """[2] of the points that are drawn after the last rollout, and of the choice."""
     return jax.random.split(jax.random.fold_in(known.key, known.count))
-
-
-def _believing(agent: PyTree, known: Believed) -> PyTree:
-    return agent._replace(interface=known)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from envs.types import Array
 
 AS_IS, CORRECTED, LEARNED = range(3)
+POLICIES = ("as_is", "corrected", "learned")  # in metrics
 
 _RIGHT, _MOST = 0.8, 0.9  # probability that a simulator is right, before any rollout and at most
 _SURE = 0.15  # no promise is surer than this of success or failure
