@@ -25,7 +25,7 @@ _SURE = 0.15  # no promise is surer than this of success or failure
 _WON, _LOST = 1.0, 0.5  # imagined rollouts of the prior as it is
 _DOUBT, _HALF = 1.5, 0.5  # imagined rollouts behind a correction of a wrong simulator, half as good as these
 _CREDIT = 1.0  # imagined rollouts of what learns, half way between the better of the two and success
-_CLEARLY, _TIMES = 0.02, 1.2  # a correction must be better by so much, what learns so many times as good
+_TIMES = 1.2  # what replaces a policy must be so many times as good: one that works may lose more than one that fails
 _WORKS = 0.5  # a correction must promise so much: where none works in any system, none of them is the real one
 _FADE = 0.9  # what learns has changed: so many times its rollouts count
 
@@ -70,7 +70,7 @@ def expected(trust: Trust, promised: Array) -> Array:
 def choice(trust: Trust, promised: Array) -> Array:
     """[] which policy to deploy. promised: [3] as of `expected`; nan for one that there is not."""
     known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised))
-    helps = (known[CORRECTED] > known[AS_IS] + _CLEARLY) & (promised[CORRECTED] >= _WORKS)
+    helps = (known[CORRECTED] > _TIMES * known[AS_IS]) & (promised[CORRECTED] >= _WORKS)
     base = jnp.where(helps, CORRECTED, AS_IS)
     which = jnp.where(known[LEARNED] > _TIMES * known[base], LEARNED, base)
     return which.astype(jnp.int32)
