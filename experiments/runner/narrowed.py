@@ -12,12 +12,13 @@ import numpy as np
 import envs
 from envs import gaps
 from envs.base import Env
+from envs.gaps import Gap
 from envs.mujoco.worlds import choose_impl
 from envs.types import Array, Key
 from experiments.runner.diagnose_run import names_of
 from experiments.runner.finetune_args import FinetuneArgs, priors_of
 from experiments.runner.options import episodes_of
-from sgft_jax.io.priors import load_prior, observed
+from sgft_jax.io.priors import load_prior, variant
 from sgft_jax.io.real import Played
 from sgft_jax.posterior.candidates import Unknown, unknowns_of, values
 from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
@@ -46,7 +47,7 @@ class Narrowed(NamedTuple):
 def narrowed(run: FinetuneArgs, home: Path) -> Narrowed:
     """Of the first seed and real system of a run in a folder."""
     prior = load_prior(priors_of(run)[0])
-    env = envs.make(run.task, choose_impl(run.impl), **observed(prior.card))
+    env = envs.make(run.task, choose_impl(run.impl), **variant(prior.card))
     unknowns, key = unknowns_of(env), jax.random.key(run.seed)
     played = episodes_of(home, run.seed)[:MOST]
     points = _drawn(prior.params.estimator, _read(env, played), len(played), len(unknowns), key)
@@ -56,8 +57,21 @@ def narrowed(run: FinetuneArgs, home: Path) -> Narrowed:
     labels = [_label(env, unknowns[i]) for i in best]
     scale = np.array([scale for _, scale in labels])
     bounds = np.moveaxis(np.quantile(numbers[..., best], (0.1, 0.9), axis=1), 0, -1)
-    truth = _truth(env, run.real[0], [unknowns[i] for i in best])
-    return Narrowed([name for name, _ in labels], scale * truth, scale[:, None] * bounds)
+    known = truth(env, gaps.load(env, run.real[0]), [unknowns[i] for i in best])
+    return Narrowed([name for name, _ in labels], scale * known, scale[:, None] * bounds)
+
+
+def truth(env: Env, real: Gap, unknowns: Sequence[Unknown]) -> np.ndarray:
+    """[k] what is true of a real system."""
+    theta = gaps.worlds(env, real, jax.random.key(0), 1).theta
+    params = dict(zip((p.name for p in env.parameters), theta.params[0], strict=True))
+
+    def value(unknown: Unknown) -> float:
+        if unknown.name in params:
+            return float(params[unknown.name])
+        return float(np.ravel(getattr(theta.effects.low, unknown.name)[0])[unknown.index])
+
+    return np.array([value(unknown) for unknown in unknowns])
 
 
 def _read(env: Env, played: Sequence[Played]) -> Rollout:
@@ -80,19 +94,6 @@ def _drawn(estimator: Estimator, rollouts: Rollout, count: int, d: int, key: Key
 
     before = jax.random.uniform(key, (_DRAWS, d))
     return jnp.stack([before, *(after(jnp.int32(n + 1)) for n in range(count))])
-
-
-def _truth(env: Env, real: str, unknowns: Sequence[Unknown]) -> np.ndarray:
-    """[k] what is true of a real system."""
-    theta = gaps.worlds(env, gaps.load(env, real), jax.random.key(0), 1).theta
-    params = dict(zip((p.name for p in env.parameters), theta.params[0], strict=True))
-
-    def value(unknown: Unknown) -> float:
-        if unknown.name in params:
-            return float(params[unknown.name])
-        return float(np.ravel(getattr(theta.effects.low, unknown.name)[0])[unknown.index])
-
-    return np.array([value(unknown) for unknown in unknowns])
 
 
 def _label(env: Env, unknown: Unknown) -> tuple[str, float]:

@@ -3,7 +3,8 @@
 calibrate: systems are drawn from the prior over what is unknown of a real one, and a shipped prior's policy plays in
 each; how often the posterior covers the truth, how far it narrows it, and what the policy that is chosen under it
 promises and does. deploy: the same choice after every rollout on drawn development gaps. In both, rollouts 0 is the
-choice without data.
+choice without data. Controls of deploy choose by what they believe instead: the posterior of another gap, one particle
+of their own, or the truth.
 """
 
 import functools
@@ -25,14 +26,15 @@ from envs.rollout import Episode, play_episode, real_env, real_worlds
 from envs.types import Array, Key, Policy, PyTree, UserError
 from experiments.runner import cli
 from experiments.runner.cli import Json
+from experiments.runner.narrowed import truth
 from experiments.runner.options import Impl, Out, at_least_one, each_once, seed_list
 from experiments.runner.progress import doing
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
 from sgft_jax.io.log import write_summary
-from sgft_jax.io.priors import load_prior, observed
+from sgft_jax.io.priors import load_prior, variant
 from sgft_jax.models.distortion import Distortion, none
-from sgft_jax.posterior.candidates import Candidates, candidates
+from sgft_jax.posterior.candidates import Candidates, candidates, point_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, play
 from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
@@ -44,6 +46,8 @@ _PLAYED = 50  # episodes of what is chosen, in the true system
 _GAPS, _LOOKED, _EVALUATED = 4, 100, 200  # of a task; episodes by which they are chosen, and in which they are judged
 _RUNS = 4  # of a gap
 _AT_ONCE = 8  # systems for which a decision is made in one program
+
+Belief = Literal["posterior", "another", "single", "truth"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,9 @@ class PosteriorArgs:
     gaps: tuple[str, ...] = ()
     """Real systems for deploy, as files of gaps; default: the drawn ones of development. It takes the four on which
     the policy starts lowest."""
+    beliefs: tuple[Belief, ...] = ("posterior",)
+    """Whose systems deploy chooses in: its own posterior's, another gap's, a single particle of its own, or the truth,
+    as far as it has unknowns."""
     seed: int = 0
     """Expert: another seed draws other systems."""
     impl: Impl = "auto"
@@ -99,7 +106,7 @@ class Setup(NamedTuple):
 def main(args: PosteriorArgs) -> None:
     """Measures, prints and writes the numbers to <out>/posterior/summary.json."""
     at_least_one(args, "systems", "rollouts")
-    each_once(args, "parts", "tasks", "rollouts")
+    each_once(args, "parts", "tasks", "rollouts", "beliefs")
     seed_list(args.seed, 1)
     if max(args.rollouts) > MOST:
         raise UserError(f"--rollouts {max(args.rollouts)}: at most {MOST} are read together")
@@ -125,7 +132,7 @@ def _set_up(args: PosteriorArgs, task: str) -> Setup:
     """The task, its systems and what is played in them."""
     prior = load_prior(f"shipped:{task}/seed-0" if args.priors is None else args.priors / task / "seed-0")
     impl = choose_impl(args.impl)
-    env = envs.make(task, impl, **observed(prior.card))
+    env = envs.make(task, impl, **variant(prior.card))
     policy = make_policy(prior.card, env)
     with doing(f"compiling the simulator and worlds of {task}", 40, once=True):
         env.prepare()
@@ -185,7 +192,7 @@ def _judged(
 
 
 def _deploy(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
-    """Gate 2: a line for each number of rollouts, over the gaps on which the policy starts lowest."""
+    """Gate 2: a line for each number of rollouts and belief, over the gaps on which the policy starts lowest."""
     estimator, key = _estimator(setup), jax.random.key(args.seed)
     key_worlds, key_look, key_before, key_run = jax.random.split(key, 4)
     real = _real(args, setup, key_worlds)
@@ -197,25 +204,30 @@ def _deploy(args: PosteriorArgs, setup: Setup) -> list[dict[str, Any]]:
         before = evaluate(setup.nothing(), which, key_before, episodes=_EVALUATED)
     room = blank(MOST, setup.env.episode_length, setup.env.measured_dim, setup.env.act_dim)
     begun = jax.tree.map(lambda x: jnp.repeat(x[None], len(which), axis=0), (setup.nothing(), room))
-    runs = _Runs(which, *begun)
-    step = jax.jit(functools.partial(_adapted, setup, real, estimator))
+    runs = {belief: _Runs(which, *begun) for belief in args.beliefs}
+    steps = {b: jax.jit(functools.partial(_adapted, setup, real, estimator, b)) for b in args.beliefs}
     lines = []
     for number in range(max(args.rollouts) + 1):
-        with doing("playing, and choosing what to deploy", 60):
-            runs, promised, played = step(runs, jnp.int32(number), jax.random.fold_in(key_run, number))
-        numbers = [np.asarray(x) for x in (promised, before, played)]
-        means = np.stack(numbers[1:], axis=1).reshape(len(lowest), _RUNS, 2).mean(axis=1)
-        by_gap = {real.names[i]: mean.tolist() for i, mean in zip(lowest, means, strict=True)}
-        lines.append({"rollouts": number} | _kept(*numbers) | {"gaps": by_gap})
+        for belief, step in steps.items():
+            with doing("playing, and choosing what to deploy", 60):
+                key = jax.random.fold_in(key_run, number)
+                runs[belief], promised, played = step(runs[belief], jnp.int32(number), key)
+            numbers = [np.asarray(x) for x in (promised, before, played)]
+            means = np.stack(numbers[1:], axis=1).reshape(len(lowest), _RUNS, 2).mean(axis=1)
+            by_gap = {real.names[i]: mean.tolist() for i, mean in zip(lowest, means, strict=True)}
+            lines.append({"rollouts": number, "belief": belief} | _kept(*numbers) | {"gaps": by_gap})
     return lines
 
 
 class _Real(NamedTuple):
-    """Real systems: their env, pools of their worlds [gaps, n], and what they are called."""
+    """Real systems: their env, pools of their worlds [gaps, n], what they are called, and the points [gaps, d] nearest
+    to them.
+    """
 
     env: Env
     pool: World
     names: list[str]
+    points: Array
 
 
 class _Runs(NamedTuple):
@@ -232,7 +244,9 @@ def _real(args: PosteriorArgs, setup: Setup, key: Key) -> _Real:
     drawn = [gaps.load(setup.env, source) for source in gaps.each(sources)]
     env = real_env(setup.env, drawn)
     with doing(f"compiling {len(drawn)} real systems of {setup.env.name}", 40):
-        return _Real(env, real_worlds(env, drawn, key), [gap.name for gap in drawn])
+        unknowns = setup.systems.unknowns
+        points = jnp.stack([point_of(unknowns, jnp.asarray(truth(setup.env, gap, unknowns))) for gap in drawn])
+        return _Real(env, real_worlds(env, drawn, key), [gap.name for gap in drawn], points)
 
 
 def _success(setup: Setup, real: _Real, deployed: Distortion, which: Array, key: Key, *, episodes: int) -> Array:
@@ -261,7 +275,7 @@ def _rollout(setup: Setup, real: _Real, which: Array, deployed: Distortion, key:
 
 
 def _adapted(
-    setup: Setup, real: _Real, estimator: Estimator, runs: _Runs, number: Array, key: Key
+    setup: Setup, real: _Real, estimator: Estimator, belief: Belief, runs: _Runs, number: Array, key: Key
 ) -> tuple[_Runs, Array, Array]:
     """Runs after a decision upon `number` rollouts, of which they play the last one; what was promised [R] for what is
     chosen, and its success [R]. Without data nothing of the choice is deployed.
@@ -276,14 +290,18 @@ def _adapted(
 
     rollouts = jax.tree.map(put, runs.rollouts, new)
 
-    def decide(row: tuple[Rollout, Key]) -> tuple[Distortion, Array]:
-        key_points, key_decide = jax.random.split(row[1])
+    def decide(row: tuple[Rollout, Array, Key]) -> tuple[Distortion, Array]:
+        key_points, key_decide = jax.random.split(row[2])
         points = _points(setup, estimator, row[0], jnp.arange(MOST) < number, key_points)
         few = points[-CANDIDATES - JUDGES :]
+        if belief in ("single", "truth"):
+            few = jnp.broadcast_to(few[0] if belief == "single" else row[1], few.shape)
         deployed, promised = choose(setup.env, setup.systems, setup.policy, setup.behind(None), few, key_decide)
         return deployed, promised[1]
 
-    chosen, promised = jax.lax.map(decide, (rollouts, keys_choose), batch_size=_AT_ONCE)
+    read = jax.tree.map(lambda x: jnp.roll(x, _RUNS, axis=0), rollouts) if belief == "another" else rollouts
+    rows = read, real.points[runs.which], keys_choose
+    chosen, promised = jax.lax.map(decide, rows, batch_size=_AT_ONCE)
     played = _success(setup, real, chosen, runs.which, key_evaluate, episodes=_EVALUATED)
     deployed = jax.tree.map(lambda a, b: jnp.where(number > 0, a, b), chosen, runs.deployed)
     return _Runs(runs.which, deployed, rollouts), promised, played

@@ -68,11 +68,23 @@ class Candidates(NamedTuple):
 
 def values(unknowns: tuple[Unknown, ...], point: Array) -> Array:
     """[d] raw units at a point [d]."""
+    log, low, width = _axes(unknowns)
+    numbers = low + width * point
+    return jnp.where(log, jnp.exp(numbers), numbers)
+
+
+def point_of(unknowns: tuple[Unknown, ...], numbers: Array) -> Array:
+    """[d] the point of the cube that is nearest to raw units [d]."""
+    log, low, width = _axes(unknowns)
+    return jnp.clip((jnp.where(log, jnp.log(jnp.where(log, numbers, 1.0)), numbers) - low) / width, 0.0, 1.0)
+
+
+def _axes(unknowns: tuple[Unknown, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[d] whether numbers are logarithms; where their axes begin, and how long they are."""
     log = np.array([u.log for u in unknowns])
     ends = (np.array([getattr(u, end) for u in unknowns]) for end in ("low", "high"))
     low, high = (np.where(log, np.log(np.where(log, end, 1.0)), end) for end in ends)
-    numbers = low + (high - low) * point
-    return jnp.where(log, jnp.exp(numbers), numbers)
+    return log, low, high - low
 
 
 def unknowns_of(env: Env) -> tuple[Unknown, ...]:

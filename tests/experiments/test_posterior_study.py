@@ -32,6 +32,7 @@ def test_all_parts_on_push(tmp_path, monkeypatch, capsys):
         rollouts=(1,),
         gaps=("envs/gaps/push.toml",),
         priors=tmp_path / "priors",
+        beliefs=("posterior", "another", "single", "truth"),
         impl="c",
         json=True,
         out=tmp_path,
@@ -39,8 +40,8 @@ def test_all_parts_on_push(tmp_path, monkeypatch, capsys):
     posterior.main(args)
     summary = json.loads((tmp_path / "posterior/summary.json").read_text())
     assert json.loads(capsys.readouterr().out) == summary
-    for lines in (summary["calibrate"], summary["deploy"]):
-        assert [line["rollouts"] for line in lines] == [0, 1]
+    for lines, beliefs in ((summary["calibrate"], 1), (summary["deploy"], 4)):
+        assert [line["rollouts"] for line in lines] == [0] * beliefs + [1] * beliefs
         numbers = [value for line in lines for value in line.values() if isinstance(value, float)]
         assert np.isfinite(numbers).all()
     assert len(summary["calibrate"][0]["by unknown"]) == 12 and len(summary["deploy"][0]["gaps"]) == 2

@@ -7,7 +7,7 @@ import pytest
 
 import envs
 from envs.base import Parameter
-from sgft_jax.posterior.candidates import Unknown, candidates, real_range, unknowns_of, values
+from sgft_jax.posterior.candidates import Unknown, candidates, point_of, real_range, unknowns_of, values
 
 # Of the tasks whose posteriors are tested. A name that is added after the test's gaps were drawn spoils the test.
 LISTED = {
@@ -52,6 +52,7 @@ def test_numbers_over_decades_are_uniform_in_their_logarithm():
     point = jnp.array([0.0, 0.5, 1.0, 0.5])
     unknowns = (*[Unknown("friction", 0, 0.1, 10.0)] * 3, Unknown("place", 0, -1.0, 2.0))
     np.testing.assert_allclose(values(unknowns, point), [0.1, 1.0, 10.0, 0.5], rtol=1e-5)
+    np.testing.assert_allclose(point_of(unknowns, values(unknowns, point)), point, atol=1e-6)
 
 
 @pytest.mark.parametrize(
