@@ -55,7 +55,12 @@ def __getattr__(name: str) -> Any:
 
 
 def make(
-    task: str, impl: str = "auto", scene: str = "", previous_actions: int = 0, system: tuple[Varying, ...] = ()
+    task: str,
+    impl: str = "auto",
+    scene: str = "",
+    previous_actions: int = 0,
+    system: tuple[Varying, ...] = (),
+    sparse: bool = False,
 ) -> Env:
     """The task of that name, file or module, compiled; impl: its physics engine, see `worlds.choose_impl`.
 
@@ -64,14 +69,17 @@ def make(
     more than the simulated one with other numbers; "" for the latter. What is observed, commanded and rewarded, and the
     parameters, are the same in all scenes of a task.
     previous_actions: how many of the last actions the observation ends with. system: what it tells of the system after
-    that; see `envs.observations` of both.
+    that; see `envs.observations` of both. sparse: whether success alone is paid, see `envs.rewards`.
     Raises UserError with the closest match for an unknown task or scene, and naming file and line for one that fails.
     """
+    from envs import rewards
     from envs.mesh import check_jax
     from envs.observations import with_previous_actions, with_system
 
     check_jax()
-    return with_system(with_previous_actions(_make(task, impl, scene), previous_actions), system)
+    env = _make(task, impl, scene)
+    env = rewards.sparse(env) if sparse else env
+    return with_system(with_previous_actions(env, previous_actions), system)
 
 
 def _make(task: str, impl: str, scene: str) -> Env:

@@ -215,6 +215,7 @@ class Env(NamedTuple):
         what `EnvState` measures; the task's page says how well.
     success_anytime: whether success counts at any step or only at the last.
     score: what a run is judged by, "success" or "return".
+    sparse: whether success alone is paid, see `envs.rewards`.
     training: the simulator's own effects, by name: values or ranges, as in a gap.
     actuators: effects of a simulator whose actuators differ too, see `envs.domains`; those not named have
         the ranges given there.
@@ -251,6 +252,7 @@ class Env(NamedTuple):
     success: Callable[[Array], Array] | None = None
     success_anytime: bool = False
     score: str = "success"
+    sparse: bool = False
     training: Mapping[str, Value] = NOTHING
     actuators: Mapping[str, Value] = NOTHING
     cartesian: bool = False

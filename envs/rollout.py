@@ -83,9 +83,8 @@ def real_env(env: Env, real_gaps: Sequence[Gap]) -> Env:
         differ = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
         raise UserError(f"{differ}: real systems of different scenes cannot share a program, run them one at a time")
     scene = "".join(scenes)
-    real = (
-        envs.make(env.name, env.impl, scene, env.previous_actions, env.system) if scene not in ("", env.scene) else env
-    )
+    seen = env.previous_actions, env.system, env.sparse
+    real = envs.make(env.name, env.impl, scene, *seen) if scene not in ("", env.scene) else env
     err = any(gap.commands for gap in real_gaps) and not real.commands
     return concealed(with_commands(real) if err else real)
 

@@ -44,14 +44,14 @@ def main(args: EstimateArgs) -> None:
     import envs
     from envs.mujoco.worlds import choose_impl
     from experiments.runner.estimating import learned
-    from sgft_jax.io.priors import load_priors, observed_by, save_prior
+    from sgft_jax.io.priors import load_priors, save_prior, variant_of
     from sgft_jax.models.config import network_of
     from sgft_jax.policies import sac_policy
     from sgft_jax.posterior.candidates import candidates
     from sgft_jax.posterior.interface import entry_of
     from sgft_jax.types import Prior
 
-    env = envs.make(task, choose_impl(args.impl), **observed_by(folders))
+    env = envs.make(task, choose_impl(args.impl), **variant_of(folders))
     priors, entry = load_priors(folders, env, estimators=True), entry_of(env)
     policy = sac_policy(env.obs_dim, env.act_dim, network_of(priors[0].card))
     with doing(f"compiling the simulator and worlds of {env.name}", 40, once=True):

@@ -89,12 +89,12 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     from experiments.runner.recorded import RecordedSystem
     from experiments.runner.training import describe, play
     from sgft_jax.algorithms import algorithm_of, make_policy
-    from sgft_jax.io.priors import load_priors, observed_by
+    from sgft_jax.io.priors import load_priors, variant_of
     from sgft_jax.io.real import RealStore
     from sgft_jax.stacking import member, part, stack
     from sgft_jax.systems.simulated import Simulated
 
-    env = envs.make(task, args.impl, **observed_by(folders))
+    env = envs.make(task, args.impl, **variant_of(folders))
     reals = [None if real == SIM else described(env, real, args.set) for real in args.real]
     priors = load_priors(folders, env)
     card, stepped = priors[0].card, is_stepped(args.real[0])

@@ -37,10 +37,10 @@ def main(args: ExportArgs) -> None:
         raise UserError(f"{existing[0]}: exists already; choose another --out, or remove it")
     import envs
     from sgft_jax.export.exported import save_exported
-    from sgft_jax.io.priors import load_prior, observed_by
+    from sgft_jax.io.priors import load_prior, variant_of
 
     for folder, path in zip(folders, homes, strict=True):
-        env = envs.make(task, **observed_by([folder]))
+        env = envs.make(task, **variant_of([folder]))
         prior = load_prior(folder, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim)
         with doing(f"exporting to {args.to} and comparing actions"):
             worst = save_exported(path, prior, env, args.to)

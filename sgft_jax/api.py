@@ -22,7 +22,7 @@ from envs.types import Array, Policy, PyTree, UserError
 from sgft_jax.algorithms import make_policy
 from sgft_jax.export import player
 from sgft_jax.io.cards import known_task
-from sgft_jax.io.priors import load_prior, observed
+from sgft_jax.io.priors import load_prior, variant
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.posterior.estimator import without_estimator
 from sgft_jax.presets import check_card
@@ -135,7 +135,7 @@ def make_env(prior: Prior, *, task: str | None = None) -> Env:
     task: where the file of a task of your own is; otherwise the prior's card names its task.
     """
     named = task or known_task("the prior's card", prior.card["task"], "task=")
-    return envs.make(named, **observed(prior.card))
+    return envs.make(named, **variant(prior.card))
 
 
 def evaluate_prior(

@@ -28,7 +28,7 @@ from experiments.runner.finetune_args import arguments, run_folder
 from experiments.runner.options import prior_folders
 from sgft_jax import api
 from sgft_jax.io.log import read_jsonl
-from sgft_jax.io.priors import load_priors, observed_by
+from sgft_jax.io.priors import load_priors, variant_of
 from sgft_jax.presets import PRESETS
 from sgft_jax.train import finetuning
 from sgft_jax.types import Metrics
@@ -82,7 +82,7 @@ def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int
 def through_system(task: str, impl: Impl, seeds: int, *, prior: Path, repeats: int) -> dict[str, Any]:
     """Seconds of a rollout and its updates of the recommended method, by both; the fastest of `repeats`, in turns."""
     folders = prior_folders(prior, out=prior, task=task, preset="")
-    env = envs.make(task, impl, **observed_by(folders))
+    env = envs.make(task, impl, **variant_of(folders))
     setup = api.setup(env, gaps.find(env.name, SIM), load_priors(folders, env), seeds=seeds)
     through = finetuning.finetune(*setup, rollouts=10**9)
     next(through)  # the fresh state

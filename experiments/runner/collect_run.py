@@ -29,7 +29,7 @@ from sgft_jax.datasets import logs, recording
 from sgft_jax.datasets.recording import Joints, Noted, Recorded
 from sgft_jax.files.disk import write_json
 from sgft_jax.io import runs
-from sgft_jax.io.priors import load_prior, observed_by
+from sgft_jax.io.priors import load_prior, variant_of
 from sgft_jax.keys import FromLog, seed_keys
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import member
@@ -88,7 +88,7 @@ def teach(args: "CollectArgs", level: float, files: Sequence[Path], kinds: Seque
 def record(args: "CollectArgs", file: Path) -> dict[str, Any]:
     """Episodes of a policy that exists."""
     assert args.policy is not None
-    env = envs.make(args.task, args.impl, **observed_by([args.policy]))
+    env = envs.make(args.task, args.impl, **variant_of([args.policy]))
     prior = load_prior(args.policy, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim)
     system = _system(args, env, 1, prior.card["gamma"])
     return _write(args, file, _play(args, system, make_policy(prior.card, env), prior.params, args.seed))

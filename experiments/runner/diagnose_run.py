@@ -28,7 +28,7 @@ from sgft_jax.analysis.verdict import Names
 from sgft_jax.diagnosis import Rollouts
 from sgft_jax.examination import Examined, Examiner
 from sgft_jax.files.disk import jsonable, write_json
-from sgft_jax.io.priors import digest, load_priors, observed_by
+from sgft_jax.io.priors import digest, load_priors, variant_of
 from sgft_jax.io.real import RealStore
 from sgft_jax.io.runs import read_config
 from sgft_jax.math import stats
@@ -112,7 +112,7 @@ def _examine(
 
 def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior]]:
     """The task as these priors see it, and the priors; raises UserError for those without V_sim or models."""
-    env = envs.make(task, impl, **observed_by(folders))
+    env = envs.make(task, impl, **variant_of(folders))
     priors = load_priors(folders, env)
     for prior in priors:
         api.check_prior(prior, get_method("sgft"), env)

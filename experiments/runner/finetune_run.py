@@ -33,7 +33,7 @@ from sgft_jax.analysis.reading import read_curve
 from sgft_jax.api import Setup
 from sgft_jax.datasets.logs import Log
 from sgft_jax.io.log import EVAL, check_finite, read_jsonl, write_summary
-from sgft_jax.io.priors import digest, load_priors, observed_by
+from sgft_jax.io.priors import digest, load_priors, variant_of
 from sgft_jax.io.real import RealStore
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, member, part
@@ -59,7 +59,7 @@ def run(
     """
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)
-    env = envs.make(args.task, args.impl, **observed_by(folders))
+    env = envs.make(args.task, args.impl, **variant_of(folders))
     _reserve(args, env, len(folders), devices)
     systems = [real_systems.described(env, name, args.set) for name in args.real]
     priors = load_priors(folders, env, estimators=True)
@@ -94,7 +94,7 @@ def run(
         if real_systems.is_robot(args.real[0]):
             prior = jax.device_get(priors[0]) if priors else None
             options = {field.name: getattr(args.options, field.name) for field in dataclasses.fields(args.options)}
-            again = functools.partial(build, args.task, args.impl, args.method, options, observed_by(folders), prior)
+            again = functools.partial(build, args.task, args.impl, args.method, options, variant_of(folders), prior)
             which = finetuning.prior_of(setup.priors, setup.seeds)
             learner = LearnerProcess(again, setup.seeds, which, setup.simulated)
             last.callback(learner.close)

@@ -22,7 +22,7 @@ from sgft_jax import stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
 from sgft_jax.io.log import MetricsLog, write_summary
-from sgft_jax.io.priors import load_priors, observed_by
+from sgft_jax.io.priors import load_priors, variant_of
 from sgft_jax.math import stats
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.systems.simulated import Simulated
@@ -39,7 +39,7 @@ _HELDOUT_SEED, FINAL_SEED = 2**31 + 4, 2**31 + 5  # held-out worlds and episodes
 def run(args: "GapsArgs", seeds: list[int], folders: list[Path]) -> dict[str, Any]:
     """Measures, prints a table, writes and returns the summary. folders: of the priors."""
     task = envs.name_of(args.task)
-    env = envs.make(args.task, args.impl, **observed_by(folders))
+    env = envs.make(args.task, args.impl, **variant_of(folders))
     reals = [gaps.load(env, name) for name in args.presets or gaps.presets(task, variants=False)]
     env = real_env(env, reals)
     folder = args.out / "gaps" / task

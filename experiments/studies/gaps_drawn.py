@@ -23,7 +23,7 @@ from experiments.runner.training import play
 from sgft_jax import api, stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.files.disk import differences, jsonable, write_json
-from sgft_jax.io.priors import digest, load_priors, observed_by
+from sgft_jax.io.priors import digest, load_priors, variant_of
 from sgft_jax.math import stats
 from sgft_jax.methods import get_method
 from sgft_jax.models.config import network_of
@@ -48,7 +48,7 @@ _SIMULATED = 8  # rollouts that tell how far the model is off in simulation; the
 def run(args: "DrawArgs", seeds: list[int], folders: list[Path]) -> tuple[list[Gap], dict[str, Any]]:
     """Draws, writes and measures gaps; prints the table and returns both. folders: of the priors."""
     task = envs.name_of(args.task)
-    env = concealed(envs.make(args.task, args.impl, **observed_by(folders)))
+    env = concealed(envs.make(args.task, args.impl, **variant_of(folders)))
     drawn = gap_distribution.draw(env, gap_distribution.load(env, args.distribution), args.seed, args.count)
     path = args.out / "gaps" / task / f"seed-{args.seed}.toml"
     write_gaps(path, drawn)

@@ -28,7 +28,7 @@ from experiments.runner.report import make_judges, value_numbers
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
 from sgft_jax.io.log import write_summary
-from sgft_jax.io.priors import load_prior, observed, save_prior
+from sgft_jax.io.priors import load_prior, save_prior, variant
 from sgft_jax.models.config import network_of
 from sgft_jax.presets import PRESETS, PretrainConfig
 from sgft_jax.stacking import stack
@@ -62,6 +62,8 @@ class ValueArgs:
     """Simulated episodes of a fit; default that of the prior's preset."""
     updates: int | None = None
     """Gradient steps of a fit; default likewise."""
+    sparse: bool = False
+    """The tasks pay success alone: V_sim and critic are fitted to that."""
     held: int = 1024
     """Fresh episodes, each with one state where the policy takes over."""
     states: int = 256
@@ -93,9 +95,9 @@ def _line(args: ValueArgs, name: str) -> dict[str, Any]:
         program, inputs = pretraining.value_fit_of(env, config, [prior], seed=args.seed)
         fit = program.lower(*inputs).compile()
         begun = time.perf_counter()
-        values = jax.block_until_ready(fit(*inputs))
+        fitted = jax.block_until_ready(fit(*inputs))
         seconds = time.perf_counter() - begun
-        (new,) = pretraining.with_values(env, [prior], values)
+        (new,) = pretraining.with_values(env, [prior], fitted)
     system, policy = all_varying(env), make_policy(new.card, env)
     value_of = policy.value
     assert value_of is not None  # as priors of SAC have it
@@ -126,7 +128,8 @@ def _config(args: ValueArgs, prior: Prior) -> PretrainConfig:
 def _env(args: ValueArgs, prior: Prior) -> Env:
     """The training domain of the prior."""
     config = prior.card.get("config", {})
-    env = envs.make(prior.card["task"], choose_impl(args.impl), **observed(prior.card))
+    rewards = {"sparse": True} if args.sparse else {}
+    env = envs.make(prior.card["task"], choose_impl(args.impl), **variant(prior.card) | rewards)
     env = with_actuators(env) if config.get("actuators") else env
     return blurred(env, config["system_noise"]) if config.get("sees_system") else env
 

@@ -60,6 +60,7 @@ class Card(TypedDict):
     gamma: Annotated[float, Meta(ge=0, lt=1)]
     algorithm: NotRequired[str]
     previous_actions: NotRequired[Count]
+    sparse: NotRequired[bool]
     system: NotRequired[list[VaryingEntry]]
     ensemble_size: NotRequired[Width]
     gap: NotRequired[_Gap | None]

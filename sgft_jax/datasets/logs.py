@@ -160,9 +160,11 @@ def _fitted(path: Path, rows: Rows, env: Env) -> Rows:
 
 
 def _judged(path: Path, rows: Rows, env: Env | None) -> Rows:
-    """With the task's rewards and terminations where the file tells none. Without a task episodes end by time alone."""
+    """With the task's rewards and terminations where the file tells none, and with sparse rewards where the task's are.
+    Without a task episodes end by time alone.
+    """
     step: tuple[Any, ...] = rows.obs, np.clip(rows.action, -1, 1), rows.next_obs
-    if rows.reward is None:
+    if rows.reward is None or (env is not None and env.sparse):
         if env is None or env.reward is None:
             raise UserError(f"{path}: tells no rewards, and neither does a task; record them as next.reward")
         reward = np.where(rows.keep, jax.vmap(env.reward)(*step), 0.0)

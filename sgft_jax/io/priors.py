@@ -137,16 +137,20 @@ def _offsets(params: Any, obs_dim: int, act_dim: int) -> int:
     return count if count <= obs_dim and (obs_dim - count) % act_dim == 0 else -1
 
 
-def observed(card: Mapping[str, Any]) -> dict[str, Any]:
-    """What the policy of a prior reads beside measurements, as arguments of `envs.make`."""
+def variant(card: Mapping[str, Any]) -> dict[str, Any]:
+    """Of its task what a prior knows, as arguments of `envs.make`: what it reads beside measurements, and rewards."""
     system = tuple(Varying(**entry) for entry in card.get("system", []))
-    return {"previous_actions": card.get("previous_actions", 0), "system": system}
+    return {
+        "previous_actions": card.get("previous_actions", 0),
+        "system": system,
+        "sparse": card.get("sparse", False),
+    }
 
 
-def observed_by(folders: Sequence[Path]) -> dict[str, Any]:
+def variant_of(folders: Sequence[Path]) -> dict[str, Any]:
     """The same for priors in folders that are used together; nothing where there is no prior."""
     home = _home(folders[0]) if folders else None
-    return observed(read_card(home) if home is not None and (home / CARD).exists() else {})
+    return variant(read_card(home) if home is not None and (home / CARD).exists() else {})
 
 
 def load_priors(folders: Sequence[Path], env: Any, *, estimators: bool = False) -> list[Prior]:
@@ -193,8 +197,7 @@ def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     shared |= {name: card["config"][name] for name in algorithm.program}
     return shared | {
         "algorithm": algorithm.name,
-        "previous_actions": card.get("previous_actions", 0),
-        "system": card.get("system", []),
+        **variant(card),
         "value_system": card.get("value_system"),
         "gap": card.get("gap"),  # methods that ask for simulated data get that of one simulator
     }

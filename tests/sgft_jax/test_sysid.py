@@ -18,7 +18,7 @@ from envs.types import Transition, UserError
 from sgft_jax import api
 from sgft_jax.algorithms import make_policy
 from sgft_jax.files.disk import jsonable
-from sgft_jax.io.priors import load_prior, observed, save_prior
+from sgft_jax.io.priors import load_prior, save_prior, variant
 from sgft_jax.learners import sac
 from sgft_jax.methods import get_method
 from sgft_jax.models import dynamics, system
@@ -149,7 +149,7 @@ def test_metrics_tell_what_was_found_in_raw_units(found, key):
 
 def test_the_card_says_what_is_told(prior):
     card = jsonable(prior.card)
-    assert observed(card) == {"previous_actions": 0, "system": SYSTEM}
+    assert variant(card) == {"previous_actions": 0, "system": SYSTEM, "sparse": False}
 
 
 def test_other_methods_refuse_such_a_prior_and_this_one_every_other(prior):
