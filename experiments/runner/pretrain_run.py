@@ -213,7 +213,7 @@ class _Run(Training):
             return pools(max(self.config.worlds, value_fit.WORLDS)), params(), seed_keys(self.seeds, Pretraining.VALUE)
 
         def valued() -> PyTree:
-            return params()._replace(value=self.fit.eval_shape(*to_fit()).value) if self.fits else params()
+            return params()._replace(value=self.fit.eval_shape(*to_fit())) if self.fits else params()
 
         if self.fits:
             ahead.promise(self.fit, to_fit)
@@ -298,8 +298,8 @@ class _Run(Training):
     def _value(self, best: evidence.Best) -> evidence.Best:
         """The best policies with a V_sim of their own; a fit that was killed is repeated, with the same bits."""
         pools, keys = self._value_pools(), seed_keys(self.seeds, Pretraining.VALUE)
-        fitted = jax.block_until_ready(self.fit(pools, best.params, keys))
-        return best._replace(params=best.params._replace(value=fitted.value))
+        value = jax.block_until_ready(self.fit(pools, best.params, keys))
+        return best._replace(params=best.params._replace(value=value))
 
     def _hand_over(self, best: evidence.Best) -> dict[str, Any]:
         """V_sim, priors with their cards, report, figures, summary, closing words."""

@@ -63,7 +63,7 @@ class ValueArgs:
     updates: int | None = None
     """Gradient steps of a fit; default likewise."""
     sparse: bool = False
-    """The tasks pay success alone: V_sim and critic are fitted to that."""
+    """Fit V_sim to success alone; tasks pay that to whoever takes the saved prior. Its critic stays."""
     held: int = 1024
     """Fresh episodes, each with one state where the policy takes over."""
     states: int = 256
@@ -95,9 +95,9 @@ def _line(args: ValueArgs, name: str) -> dict[str, Any]:
         program, inputs = pretraining.value_fit_of(env, config, [prior], seed=args.seed)
         fit = program.lower(*inputs).compile()
         begun = time.perf_counter()
-        fitted = jax.block_until_ready(fit(*inputs))
+        values = jax.block_until_ready(fit(*inputs))
         seconds = time.perf_counter() - begun
-        (new,) = pretraining.with_values(env, [prior], fitted)
+        (new,) = pretraining.with_values(env, [prior], values)
     system, policy = all_varying(env), make_policy(new.card, env)
     value_of = policy.value
     assert value_of is not None  # as priors of SAC have it
@@ -128,8 +128,8 @@ def _config(args: ValueArgs, prior: Prior) -> PretrainConfig:
 def _env(args: ValueArgs, prior: Prior) -> Env:
     """The training domain of the prior."""
     config = prior.card.get("config", {})
-    rewards = {"sparse": True} if args.sparse else {}
-    env = envs.make(prior.card["task"], choose_impl(args.impl), **variant(prior.card) | rewards)
+    rewards = {"sparse": args.sparse or prior.card.get("sparse", False)}
+    env = envs.make(prior.card["task"], choose_impl(args.impl), **{**variant(prior.card), **rewards})
     env = with_actuators(env) if config.get("actuators") else env
     return blurred(env, config["system_noise"]) if config.get("sees_system") else env
 

@@ -17,7 +17,6 @@ from sgft_jax.algorithms import make_policy, recipe_of
 from sgft_jax.files.disk import jsonable
 from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.models import normalizer
-from sgft_jax.models.config import network_of
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.stacking import member, stack
 from sgft_jax.train import fleet, value_fit
@@ -139,10 +138,9 @@ def priors_of(env: Env, config: PretrainConfig, state: FleetState) -> list[Prior
 
 
 def refitted(env: Env, config: PretrainConfig, priors: Sequence[Prior], *, seed: int = 0) -> list[Prior]:
-    """The same priors of SAC, policies of one task, with a new V_sim, and a new critic where `env` pays success alone.
+    """The same priors of SAC, policies of one task, with a new V_sim. env: with the training domain's effects.
 
-    env: with the training domain's effects.
-    config: how they are fitted, with the discount and the network of the priors.
+    config: how it is fitted, with the discount and the network of the priors.
     """
     fit, inputs = value_fit_of(env, config, priors, seed=seed)
     return with_values(env, priors, fit(*inputs))
@@ -164,21 +162,19 @@ def told(system: tuple[Varying, ...]) -> dict[str, Any]:
     return {"value_system": [v._asdict() for v in system]}
 
 
-def with_values(env: Env, priors: Sequence[Prior], fitted: value_fit.Fitted) -> list[Prior]:
-    """These priors with what has been fitted for them [M, ...]."""
-    entries = {**told(all_varying(env)), "sparse": env.sparse}
-    changes = {name: x for name, x in fitted._asdict().items() if x is not None}
+def with_values(env: Env, priors: Sequence[Prior], values: PyTree) -> list[Prior]:
+    """These priors with other parameters of V_sim [M, ...], which knows the rewards of `env`."""
+    facts = {**told(all_varying(env)), "sparse": env.sparse}
     return [
-        Prior(prior.params._replace(**member(changes, i)), {**prior.card, **entries}) for i, prior in enumerate(priors)
+        Prior(prior.params._replace(value=member(values, i)), {**prior.card, **facts}) for i, prior in enumerate(priors)
     ]
 
 
 def make_value_program(
     env: Env, config: PretrainConfig, system: tuple[Varying, ...], card: Mapping[str, Any], members: int
 ) -> Any:
-    """(pools [M, W], params [M, ...], keys [M]) -> `Fitted` [M, ...] for policies with that card, jitted."""
-    critic = network_of(card, "critic_network") if env.sparse else None
-    fit = functools.partial(value_fit.fit_value, env, system, make_policy(card, env), config, critic)
+    """(pools [M, W], params [M, ...], keys [M]) -> V_sim's parameters [M, ...] of policies with that card, jitted."""
+    fit = functools.partial(value_fit.fit_value, env, system, make_policy(card, env), config)
     return jax.jit(over_members(fit, members))
 
 

@@ -1,13 +1,11 @@
 """V_sim's own stage, after training: the policy is frozen, and V is fitted to its returns on and off its path. Pure.
 
 Episodes begin with random actions, as many of them as a share from 0 to 1 says, until a random step; from then on the
-policy acts as it is deployed. The returns of these steps know no entropy and no exploration. Where the task pays
-success alone, the critic is fitted to them too: the one that the policy was trained by knows other rewards.
+policy acts as it is deployed. The returns of these steps know no entropy and no exploration.
 """
 
 import functools
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -20,18 +18,16 @@ from envs.observations import with_system
 from envs.rollout import play_episode
 from envs.types import Array, Key, Policy, PyTree
 from sgft_jax.math import optim
-from sgft_jax.models.config import NetworkConfig
-from sgft_jax.models.networks import make_critic, make_value, precision
+from sgft_jax.models.networks import make_value, precision
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.models.value import discounted_returns, inputs, lambda_returns, make_v_sim
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.types import Normalizer
 
-__all__ = ["Fitted", "Held", "Rows", "fit", "fit_critic", "fit_value", "hold", "play_ladder", "replays"]
+__all__ = ["Held", "Rows", "fit", "fit_value", "hold", "play_ladder", "replays"]
 
 _ROUNDS, _MIXED = 40, 0.9  # times that targets are computed anew, and lambda of the returns that they are
 _PLAYED, _VALUED = 4096, 1024  # episodes that are played, and valued, together
-_TWINS = 2  # critics
 WORLDS = 256  # of the pool, at least
 _LEFT = 0.01  # share of the discounted weight that is left where a measured episode ends
 _LR = 3e-3  # of Adam at the start; it falls to 0 along half a cosine
@@ -40,13 +36,12 @@ _LR = 3e-3  # of Adam at the start; it falls to 0 along half a cosine
 class Rows(NamedTuple):
     """Episodes of T steps.
 
-    obs: [T + 1, obs_dim] raw. action: [T, act_dim]. system: [k] in [-1, 1]. reward, discount: [T]. switch: [] int32,
-    the step from which on the policy acts. intact: [] bool, whether the physics did not explode. valid: [T] bool, False
-    after the end. world: [] int32, where it took place in the pool.
+    obs: [T + 1, obs_dim] raw. system: [k] in [-1, 1]. reward, discount: [T]. switch: [] int32, the step from which on
+    the policy acts. intact: [] bool, whether the physics did not explode. valid: [T] bool, False after the end.
+    world: [] int32, where it took place in the pool.
     """
 
     obs: Array
-    action: Array
     system: Array
     reward: Array
     discount: Array
@@ -90,7 +85,6 @@ def play_ladder(
     seen = jnp.concatenate([rows.obs, rows.next_obs[-1:]])
     return Rows(
         obs=seen[:, : env.obs_dim],
-        action=rows.action,
         system=seen[0, env.obs_dim :],
         reward=rows.reward,
         discount=rows.discount,
@@ -122,10 +116,12 @@ def fit(config: PretrainConfig, rows: Rows, normalizer: Normalizer, key: Key, *,
     def targets(params: PyTree) -> Array:
         """[E, T] in units of the network's output."""
 
-        def value(obs: Array, system: Array) -> Array:
-            return middle + scale * network.apply(params, obs, system)
+        def of_episode(episode: tuple[Array, Rows]) -> Array:
+            obs, row = episode
+            values = middle + scale * jax.vmap(network.apply, (None, 0, None))(params, obs, row.system)
+            return lambda_returns(row.reward, row.discount, values, mixed=_MIXED)
 
-        return (_goals(value, seen, rows) - middle) / scale
+        return (jax.lax.map(of_episode, (seen, rows), batch_size=min(episodes, _VALUED)) - middle) / scale
 
     def update(state: tuple[optim.Fit, Array], step: tuple[Key, Array]) -> tuple[tuple[optim.Fit, Array], None]:
         (held, wanted), (key, number) = state, step
@@ -159,86 +155,16 @@ def fit(config: PretrainConfig, rows: Rows, normalizer: Normalizer, key: Key, *,
     return _rescaled(held.params, f"Dense_{len(config.network.hidden)}", middle, scale)
 
 
-def fit_critic(
-    config: PretrainConfig, rows: Rows, normalizer: Normalizer, value: PyTree, network: NetworkConfig, key: Key
-) -> PyTree:
-    """Parameters of a twin of `make_critic`: what actions of episodes [E] are worth to the policy, in float32.
-
-    Each twin draws rows of its own, of the steps that the policy takes and the random one before. value: of V_sim,
-    fitted to these episodes, in which targets end.
-    """
-    episodes, _, obs_dim = rows.obs.shape
-    steps, act_dim = rows.action.shape[1:]
-    starts = jnp.maximum(rows.switch - 1, 0)
-    critic, optimiser = make_critic(obs_dim, act_dim, network), optim.adam()
-    v_sim = make_v_sim(obs_dim, config.network, system=rows.system.shape[1], members=config.ensemble_size)
-    seen = jax.vmap(jax.vmap(normalize, (None, 0)), (None, 0))(normalizer, rows.obs)
-    counts = (jnp.arange(steps)[None] >= starts[:, None]) & rows.valid & rows.intact[:, None]
-    key_init, key_steps = jax.random.split(key)
-
-    def update(held: optim.Fit, step: tuple[Key, Array]) -> tuple[optim.Fit, None]:
-        key_episode, key_time = jax.random.split(step[0])
-        shape = _TWINS, config.batch_size
-        which = jax.random.randint(key_episode, shape, 0, episodes)
-        when = starts[which] + jnp.int32(jax.random.uniform(key_time, shape) * (steps - starts[which]))
-        obs, action = seen[which, when], rows.action[which, when]
-        goal, weight = (wanted[which, when] - middle) / scale, counts[which, when].astype(jnp.float32)
-
-        def loss(params: PyTree) -> tuple[Array, tuple[()]]:
-            def twin(params: PyTree, obs: Array, action: Array) -> Array:
-                alone = jax.tree.map(lambda x: x[None], params)
-                return jax.vmap(critic.apply, (None, 0, 0))(alone, obs, action)[:, 0]
-
-            return jnp.sum(weight * (jax.vmap(twin)(params, obs, action) - goal) ** 2) / config.batch_size, ()
-
-        held, _, _ = optim.minimise(optimiser, loss, held, _LR * optim.cosine_factor(step[1], config.value_updates))
-        return held, None
-
-    with precision("float32"):
-        wanted = _goals(functools.partial(v_sim.apply, value), seen, rows)
-        middle = jnp.mean(wanted, where=counts)
-        scale = jnp.std(wanted, where=counts) + 1e-6
-        steps_of = jax.random.split(key_steps, config.value_updates), jnp.arange(config.value_updates)
-        held, _ = jax.lax.scan(update, optim.start(optimiser, critic.init(key_init)), steps_of)
-    return _rescaled(held.params, f"Dense_{len(network.hidden)}", middle, scale)
-
-
-def _goals(value: Callable[[Array, Array], Array], seen: Array, rows: Rows) -> Array:
-    """[E, T] lambda-returns that end in value(normalised obs, system). seen: [E, T + 1, obs_dim] normalised."""
-
-    def of_episode(episode: tuple[Array, Rows]) -> Array:
-        obs, row = episode
-        return lambda_returns(row.reward, row.discount, jax.vmap(value, (0, None))(obs, row.system), mixed=_MIXED)
-
-    return jax.lax.map(of_episode, (seen, rows), batch_size=min(len(seen), _VALUED))
-
-
 def _rescaled(params: PyTree, last: str, middle: Array, scale: Array) -> PyTree:
     """The network whose output is middle + scale * output. last: the name of its last layer."""
     layer = params[last]
     return {**params, last: {"kernel": scale * layer["kernel"], "bias": middle + scale * layer["bias"]}}
 
 
-class Fitted(NamedTuple):
-    """Parameters of V_sim, and of the critic where it was fitted, else None."""
-
-    value: PyTree
-    critic: PyTree = None
-
-
 def fit_value(
-    env: Env,
-    system: tuple[Varying, ...],
-    policy: Policy,
-    config: PretrainConfig,
-    critic: NetworkConfig | None,
-    pool: World,
-    params: PyTree,
-    key: Key,
-) -> Fitted:
-    """What is fitted to the returns of one prior: plays the episodes and fits. critic: its network, None to keep it.
-    params: of the prior, without a value.
-    """
+    env: Env, system: tuple[Varying, ...], policy: Policy, config: PretrainConfig, pool: World, params: PyTree, key: Key
+) -> PyTree:
+    """Parameters of V_sim of one prior: plays the episodes and fits. params: of the prior, without a value."""
     key_play, key_fit = jax.random.split(key)
     at_once = min(config.value_episodes, _PLAYED)
     parts = -(-config.value_episodes // at_once)
@@ -247,10 +173,7 @@ def fit_value(
     keys = jax.random.split(key_play, (parts, at_once))
     rows = jax.lax.map(split_vmap(play), keys)
     rows = whole(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows))
-    value = fit(config, rows, params.normalizer, key_fit, starts=env.episode_length)
-    if critic is None:
-        return Fitted(value)
-    return Fitted(value, fit_critic(config, rows, params.normalizer, value, critic, jax.random.fold_in(key_fit, 1)))
+    return fit(config, rows, params.normalizer, key_fit, starts=env.episode_length)
 
 
 # --- how good it is ---------------------------------------------------------------------------------------------------
@@ -333,6 +256,6 @@ def replays(
 
 
 def bytes_of(env: Env, config: PretrainConfig) -> int:
-    """Bytes that the episodes of one fit take: observations as they are and normalised, actions, rewards, targets."""
+    """Bytes that the episodes of one fit take: observations as they are and normalised, rewards, targets."""
     steps = config.value_episodes * length_of(env, config.gamma, config.value_left)
-    return 4 * steps * (2 * env.obs_dim + env.act_dim + 4)
+    return 4 * steps * (2 * env.obs_dim + 4)

@@ -10,6 +10,7 @@ import pytest
 import toy
 
 from envs.observations import with_previous_actions
+from envs.rewards import sparse
 from envs.types import UserError
 from sgft_jax.datasets import lerobot, logs
 from sgft_jax.datasets.recording import Recorded
@@ -148,6 +149,12 @@ def test_the_task_tells_rewards_and_ends_that_others_do_not(tmp_path):
     np.testing.assert_allclose(log.rows.reward, -np.sqrt(2) * np.array([1, 2, 3, 51, 52]), rtol=1e-6)  # of xy alone
     np.testing.assert_array_equal(log.rows.discount, np.float32([0.9, 0.9, 0.9, 0.9, 0.0]))
     assert "tells no rewards, and neither does a task" in refused(folder)
+
+
+def test_a_task_that_pays_success_alone_pays_recorded_steps_so(tmp_path):
+    close = ENV._replace(success=lambda obs: obs[0] > 2.5)
+    log = logs.load(write(tmp_path / "set"), gamma=0.9, env=sparse(close))
+    assert log.rows.reward.tolist() == [0, 0, 1, 1, 1] and log.facts.return_max == 2.0
 
 
 def test_done_alone_is_no_termination(tmp_path):
