@@ -1,19 +1,30 @@
 """Evaluate priors, or what fine-tuning has saved, in simulation or on "real" systems."""
 
 import contextlib
+import itertools
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from envs import gaps
+from envs import extend, gaps
 from envs.gaps import SIM
 from envs.types import UserError
 from experiments.runner import cli, options
 from experiments.runner.cli import Json
 from experiments.runner.options import Impl, Out
 from experiments.runner.progress import doing
-from experiments.runner.real_systems import ENOUGH, REMOTE, TOGETHER, advice, connect, described, is_robot, is_stepped
+from experiments.runner.real_systems import (
+    ENOUGH,
+    REMOTE,
+    TOGETHER,
+    advice,
+    by_scene,
+    connect,
+    described,
+    is_robot,
+    is_stepped,
+)
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import DEFAULT, get_method
@@ -80,6 +91,14 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     """Success with its 95 % Wilson interval, mean return and share of exploded episodes of every policy everywhere."""
     args = replace(args, real=gaps.each(args.real))
     folders, task = check(args)
+    groups = by_scene(extend.name_of(task), args.real)
+    results = [_evaluate(replace(args, real=reals), folders, task) for reals in groups]
+    systems = dict(zip(itertools.chain(*groups), itertools.chain(*(one["systems"] for one in results)), strict=True))
+    return {**results[0], "systems": [systems[real] for real in args.real]}
+
+
+def _evaluate(args: EvaluateArgs, folders: list[Path], task: str) -> dict[str, Any]:
+    """The same on real systems that share a program. folders: of the policies."""
     import jax
     import jax.numpy as jnp
 

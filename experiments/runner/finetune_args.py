@@ -12,7 +12,7 @@ from envs import extend, gaps
 from envs.types import UserError
 from experiments.runner import options
 from experiments.runner.options import FirstSeed, Impl, Out, Successors, Task
-from experiments.runner.real_systems import REMOTE, is_robot, title
+from experiments.runner.real_systems import REMOTE, by_scene, is_robot, title
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.files.disk import jsonable
 from sgft_jax.methods import DEFAULT, get_method
@@ -102,13 +102,16 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     method, seeds = check(args)
     args = resolved(args)
     priors = priors_of(args)
-    # Every folder is that of a run on its real system alone: either kind of run continues the other.
-    # A robot may come back at another address.
-    named = [REMOTE if is_robot(name) else name for name in args.real]
-    homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
     from experiments.runner.finetune_run import run  # JAX starts here
 
-    return run(args, method, seeds, priors, homes)
+    summaries: dict[str, dict[str, Any]] = {}
+    for reals in by_scene(extend.name_of(args.task), args.real):
+        # Every folder is that of a run on its real system alone: either kind of run continues the other.
+        # A robot may come back at another address.
+        named = [REMOTE if is_robot(name) else name for name in reals]
+        homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
+        summaries |= zip(reals, run(replace(args, real=reals), method, seeds, priors, homes), strict=True)
+    return [summaries[name] for name in args.real]
 
 
 def arguments(method: str, **changes: Any) -> FinetuneArgs:

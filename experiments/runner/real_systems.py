@@ -49,6 +49,15 @@ def is_stepped(real: str) -> bool:
     return real.startswith(GYMNASIUM) or is_robot(real)
 
 
+def by_scene(task: str, reals: Sequence[str]) -> list[tuple[str, ...]]:
+    """Real systems in the groups that one program can step: those of one scene, in the order of the first ones."""
+    groups: dict[str, tuple[str, ...]] = {}
+    for real in reals:
+        scene = "" if is_stepped(real) else gaps.find(task, real).scene
+        groups[scene] = (*groups.get(scene, ()), real)
+    return list(groups.values())
+
+
 def title(real: str) -> str:
     """What folders call a real system: `gymnasium-HalfCheetah-v5`, `remote`, or the name of the gap."""
     if is_robot(real):

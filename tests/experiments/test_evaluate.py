@@ -165,3 +165,17 @@ def test_a_bad_command_is_one_line_and_code_2(argv, words, capsys):
         call(*argv)
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and words in error and error.count("\n") == 1
+
+
+def test_systems_of_several_scenes_are_played_one_scene_after_another(monkeypatch):
+    file, groups = "envs/gaps/development/push-unexplained.toml", []
+
+    def play(args, folders, task):
+        groups.append([real.rpartition(":")[2] for real in args.real])
+        return {"task": task, "systems": [{"where": real} for real in args.real]}
+
+    monkeypatch.setattr(evaluate, "_evaluate", play)
+    args = evaluate.EvaluateArgs(prior=Path("shipped:push"), real=(f"{file}:push-4-02", f"{file}:push-4-03", "default"))
+    systems = evaluate.evaluate(args)["systems"]
+    assert groups == [["push-4-02", "default"], ["push-4-03"]]
+    assert [system["where"] for system in systems] == list(args.real)

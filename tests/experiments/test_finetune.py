@@ -25,7 +25,7 @@ from envs import gaps
 from envs.rollout import Episode, play_episode
 from envs.types import Transition, UserError
 from experiments import evaluate, finetune
-from experiments.runner import finetune_run, pictures
+from experiments.runner import finetune_args, finetune_run, pictures
 from experiments.runner.finetune_args import FinetuneArgs, arguments, run_folder
 from experiments.runner.finetune_run import FinetuneRecord
 from experiments.runner.recorded import RecordedSystem
@@ -735,3 +735,18 @@ def test_the_film_shows_an_episode_that_only_the_tuned_agent_solves(tmp_path, mo
     assert (only_new.size > 0) == (words is not None)
     if words:
         assert [caption.split(": ")[1] for caption in captions] == list(words)
+
+
+def test_systems_of_several_scenes_are_fine_tuned_one_scene_after_another(tmp_path, monkeypatch):
+    file, groups = "envs/gaps/development/push-unexplained.toml", []
+
+    def run(args, method, seeds, priors, homes):
+        groups.append([home.parents[1].name for home in homes])
+        assert [config["real"] for config in homes.values()] == list(args.real)
+        return [{"gap": real} for real in args.real]
+
+    monkeypatch.setattr(finetune_run, "run", run)
+    reals = (f"{file}:push-4-02", f"{file}:push-4-03", f"{file}:push-4-06")
+    args = arguments("sac", task="push", prior=Path("shipped:push"), real=reals, out=tmp_path)
+    assert [summary["gap"] for summary in finetune_args.finetune(args)] == list(reals)
+    assert groups == [["push-4-02", "push-4-06"], ["push-4-03"]]
