@@ -91,7 +91,9 @@ def _line(args: ValueArgs, name: str) -> dict[str, Any]:
     prior = load_prior(name)
     config, env = _config(args, prior), _env(args, prior)
     key_held, key_again, key_worlds = jax.random.split(jax.random.fold_in(jax.random.key(2**31 + 3), args.seed), 3)
-    with doing(f"fitting V_sim of {name}", 60, once=True):
+    # On two cores of a CPU the updates take most of the time.
+    about = 30 + 0.1 * config.value_updates if jax.default_backend() == "cpu" else 60
+    with doing(f"fitting V_sim of {name}", about, once=True):
         program, inputs = pretraining.value_fit_of(env, config, [prior], seed=args.seed)
         fit = program.lower(*inputs).compile()
         begun = time.perf_counter()
