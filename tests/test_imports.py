@@ -61,6 +61,7 @@ ORDER = {
             "domains",
             "patches",
             "observations",
+            "rewards",
             "gaps",
         ),
         *("gap_distribution", "checks", "mujoco", "control", "franka", "locomotion", "", "rollout", "adapters"),

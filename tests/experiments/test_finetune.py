@@ -340,7 +340,7 @@ def test_a_file_without_a_name_means_all_of_its_gaps(tmp_path, monkeypatch):
     save_prior(tmp_path / "prior/seed-0", 0, task="push")
     monkeypatch.setattr(finetune_run, "run", lambda args, *given: args.real)
     args = arguments("sac", prior=tmp_path / "prior", real=("sim", str(file)), out=tmp_path)
-    assert finetune.finetune(args) == ("sim", f"{file}:a", f"{file}:b")
+    assert finetune.finetune(args) == ["sim", f"{file}:a", f"{file}:b"]
 
 
 def test_a_variant_has_a_folder_beside_its_method():

@@ -316,7 +316,7 @@ def test_a_prior_that_a_killed_writer_has_put_aside_is_read(tmp_path):
         folder.rename(folder.with_name(f"{ASIDE}{folder.name}"))
     for folder in (tmp_path / "seed-0", tmp_path / "run"):
         assert bits(priors.load_prior(folder).params) == bits(make_prior(2.0).params)
-        assert priors.variant_of([folder]) == {"previous_actions": 0, "system": ()}
+        assert priors.variant_of([folder]) == {"previous_actions": 0, "system": (), "sparse": False}
     save(tmp_path / "seed-0", 3.0)
     assert sorted(os.listdir(tmp_path)) == ["run", "seed-0"]
 
