@@ -84,6 +84,8 @@ def main(args: ValueArgs) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_summary(folder, {"lines": lines})
     print(json.dumps(lines) if args.json else _table(lines))
+    for name in args.priors if args.save and not args.json else ():
+        print(f"prior: {_saved(args, name)}")
 
 
 def _line(args: ValueArgs, name: str) -> dict[str, Any]:
@@ -111,11 +113,14 @@ def _line(args: ValueArgs, name: str) -> dict[str, Any]:
         old = jax.vmap(lambda obs: value_of(prior.params, obs))(jnp.asarray(held.obs))
     missed = held.returns - np.asarray(old)
     if args.save:
-        save_prior(
-            args.out / "value" / name.replace("shipped:", ""), Prior(new.params, {**new.card, "metrics": judged})
-        )
+        save_prior(_saved(args, name), Prior(new.params, {**new.card, "metrics": judged}))
     before = float(1 - np.var(missed) / np.var(held.returns)) if prior.params.value is not None else None
     return {"prior": name, "seconds": seconds, "before": before, **judged}
+
+
+def _saved(args: ValueArgs, name: str) -> Path:
+    """Where a prior with its new V_sim goes."""
+    return args.out / "value" / name.replace("shipped:", "")
 
 
 def _config(args: ValueArgs, prior: Prior) -> PretrainConfig:
