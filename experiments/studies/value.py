@@ -20,6 +20,7 @@ from envs.base import Env
 from envs.domains import sample_worlds, with_actuators
 from envs.mujoco.worlds import choose_impl
 from envs.observations import all_varying, blurred
+from envs.types import UserError
 from experiments.runner import cli
 from experiments.runner.cli import Json
 from experiments.runner.options import Impl, Out
@@ -69,7 +70,7 @@ class ValueArgs:
     states: int = 256
     """Of these states, those that are played again in 16 worlds."""
     save: bool = False
-    """Save the priors with their new V_sim."""
+    """Save the priors with their new V_sim, in <out>/value/<task>."""
     seed: int = 0
     """Another seed draws other worlds and episodes."""
     impl: Impl = "auto"
@@ -79,18 +80,21 @@ class ValueArgs:
 
 def main(args: ValueArgs) -> None:
     """Measures, prints a table, and leaves `value/summary.json`."""
-    lines = [_line(args, name) for name in args.priors]
+    priors = [load_prior(name) for name in args.priors]
     folder = args.out / "value"
+    homes = [folder / prior.card["task"] / Path(name).name for name, prior in zip(args.priors, priors, strict=True)]
+    if args.save and len(set(homes)) < len(homes):
+        raise UserError(f"--save: {folder} would hold two priors in one folder; study them in --out of their own")
+    lines = [_line(args, *row) for row in zip(args.priors, priors, homes, strict=True)]
     folder.mkdir(parents=True, exist_ok=True)
     write_summary(folder, {"lines": lines})
     print(json.dumps(lines) if args.json else _table(lines))
-    for name in args.priors if args.save and not args.json else ():
-        print(f"prior: {_saved(args, name)}")
+    for home in homes if args.save and not args.json else ():
+        print(f"prior: {home}")
 
 
-def _line(args: ValueArgs, name: str) -> dict[str, Any]:
-    """The numbers of one prior; seconds of its fit, compiled."""
-    prior = load_prior(name)
+def _line(args: ValueArgs, name: str, prior: Prior, home: Path) -> dict[str, Any]:
+    """The numbers of one prior, whose new V_sim goes home if asked for; seconds of its fit, compiled."""
     config, env = _config(args, prior), _env(args, prior)
     key_held, key_again, key_worlds = jax.random.split(jax.random.fold_in(jax.random.key(2**31 + 3), args.seed), 3)
     # On two cores of a CPU the updates take most of the time.
@@ -113,14 +117,9 @@ def _line(args: ValueArgs, name: str) -> dict[str, Any]:
         old = jax.vmap(lambda obs: value_of(prior.params, obs))(jnp.asarray(held.obs))
     missed = held.returns - np.asarray(old)
     if args.save:
-        save_prior(_saved(args, name), Prior(new.params, {**new.card, "metrics": judged}))
+        save_prior(home, Prior(new.params, {**new.card, "metrics": judged}))
     before = float(1 - np.var(missed) / np.var(held.returns)) if prior.params.value is not None else None
     return {"prior": name, "seconds": seconds, "before": before, **judged}
-
-
-def _saved(args: ValueArgs, name: str) -> Path:
-    """Where a prior with its new V_sim goes."""
-    return args.out / "value" / name.replace("shipped:", "")
 
 
 def _config(args: ValueArgs, prior: Prior) -> PretrainConfig:
