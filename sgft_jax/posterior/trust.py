@@ -1,10 +1,11 @@
 """Which of three policies to deploy: real rollouts count for and against what simulation promises of them. Pure.
 
 The three are the prior as it is, which stays for good, the prior behind the correction that the posterior chooses, and
-what learns. Either the simulator is right about them, then a rollout succeeds as often as it promised, or it says
-nothing, then only what a policy did in real rollouts counts. Every rollout changes how probable the first is (Bayes'
-rule), by how well it was promised. So under a misfit promises fade to the policies' own records, and simulation can
-neither veto nor promote; and what learns is tried where the others fail, whatever simulation says.
+what learns. Either the simulator is right about them, then a rollout succeeds as often as it promised, which counts as
+four rollouts, or it says nothing, then only what a policy did in real rollouts counts. Every rollout changes how
+probable the first is (Bayes' rule), by how well it was promised. So under a misfit promises fade to the policies' own
+records, and simulation can neither veto nor promote; and what learns is tried where the others fail, whatever
+simulation says.
 
 tests/sgft_jax/posterior/test_trust.py states the errors, for simulators of several biases.
 """
@@ -27,6 +28,7 @@ _DOUBT, _HALF = 1.5, 0.5  # imagined rollouts behind a correction of a wrong sim
 _CREDIT = 1.0  # imagined rollouts of what learns, half way between the better of the two and success
 _TIMES = 1.2  # what replaces a policy must be so many times as good: one that works may lose more than one that fails
 _WORKS = 0.5  # a correction must promise so much: where none works in any system, none of them is the real one
+_PROMISE = 4.0  # rollouts that a promise counts as, beside those that a policy has played
 _FADE = 0.9  # what learns has changed: so many times its rollouts count
 
 
@@ -64,7 +66,8 @@ def faded(trust: Trust) -> Trust:
 def expected(trust: Trust, promised: Array) -> Array:
     """[3] the success to expect of the policies. promised: [3] by the simulator, nan where it has not tried one."""
     right, records = jnp.minimum(jax.nn.sigmoid(trust.log_odds), _MOST), _records(trust)
-    return jnp.where(jnp.isnan(promised), records, right * promised + (1.0 - right) * records)
+    seen = (_PROMISE * promised + trust.won) / (_PROMISE + trust.won + trust.lost)
+    return jnp.where(jnp.isnan(promised), records, right * seen + (1.0 - right) * records)
 
 
 def choice(trust: Trust, promised: Array) -> Array:

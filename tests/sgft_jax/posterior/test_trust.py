@@ -45,22 +45,22 @@ def fates(bias, std, *, learns):
 # what learns is tried; bias for the prior as it is, behind a correction, and for what learns, std; then at most: runs
 # that are 20 points below the prior at the end, at any time; at least: share of the possible gain, over all rollouts
 CASES = [
-    (False, (0.0, 0.0, 0.0), 0.0, 0.0005, 0.0005, 0.80),
-    (False, (0.0, 0.0, 0.0), 0.1, 0.001, 0.002, 0.77),
-    (False, (0.0, 0.0, 0.0), 0.3, 0.007, 0.03, 0.56),
-    (False, (0.3, 0.3, 0.0), 0.1, 0.001, 0.002, 0.66),
-    (False, (-0.3, -0.3, 0.0), 0.1, 0.001, 0.001, 0.42),
-    (False, (0.0, 0.3, 0.0), 0.0, 0.003, 0.015, 0.88),
-    (False, (0.0, 0.3, 0.0), 0.3, 0.015, 0.08, 0.70),
-    (False, (0.0, -0.3, 0.0), 0.1, 0.001, 0.001, 0.35),
-    (True, (0.0, 0.0, 0.0), 0.0, 0.001, 0.01, 0.91),
-    (True, (0.0, 0.0, 0.0), 0.1, 0.003, 0.02, 0.88),
-    (True, (0.0, 0.0, 0.0), 0.3, 0.025, 0.1, 0.71),
-    (True, (0.3, 0.3, 0.3), 0.1, 0.01, 0.07, 0.76),
-    (True, (-0.3, -0.3, -0.3), 0.1, 0.01, 0.07, 0.77),
-    (True, (0.0, 0.0, 0.3), 0.3, 0.03, 0.13, 0.70),
-    (True, (0.0, 0.3, 0.3), 0.3, 0.03, 0.15, 0.74),
-    (True, (-0.6, -0.6, -0.6), 0.1, 0.015, 0.17, 0.55),
+    (False, (0.0, 0.0, 0.0), 0.0, 0.0005, 0.001, 0.78),
+    (False, (0.0, 0.0, 0.0), 0.1, 0.001, 0.003, 0.75),
+    (False, (0.0, 0.0, 0.0), 0.3, 0.004, 0.03, 0.59),
+    (False, (0.3, 0.3, 0.0), 0.1, 0.001, 0.01, 0.71),
+    (False, (-0.3, -0.3, 0.0), 0.1, 0.001, 0.001, 0.41),
+    (False, (0.0, 0.3, 0.0), 0.0, 0.004, 0.04, 0.84),
+    (False, (0.0, 0.3, 0.0), 0.3, 0.006, 0.08, 0.72),
+    (False, (0.0, -0.3, 0.0), 0.1, 0.001, 0.001, 0.36),
+    (True, (0.0, 0.0, 0.0), 0.0, 0.001, 0.02, 0.89),
+    (True, (0.0, 0.0, 0.0), 0.1, 0.003, 0.03, 0.87),
+    (True, (0.0, 0.0, 0.0), 0.3, 0.015, 0.1, 0.75),
+    (True, (0.3, 0.3, 0.3), 0.1, 0.012, 0.1, 0.79),
+    (True, (-0.3, -0.3, -0.3), 0.1, 0.006, 0.05, 0.75),
+    (True, (0.0, 0.0, 0.3), 0.3, 0.02, 0.14, 0.73),
+    (True, (0.0, 0.3, 0.3), 0.3, 0.02, 0.17, 0.77),
+    (True, (-0.6, -0.6, -0.6), 0.1, 0.02, 0.15, 0.51),
 ]
 
 
@@ -94,6 +94,15 @@ def test_a_promise_that_is_kept_is_trusted_more():
     kept = trust.told(known, CORRECTED, promised, True)
     assert kept.log_odds > known.log_odds
     assert trust.expected(kept, promised)[CORRECTED] > trust.expected(known, promised)[CORRECTED]
+
+
+def test_rollouts_count_beside_a_promise():
+    """A prior of which simulation promises two in three, but that has never failed, stays."""
+    promised = jnp.array([0.66, 0.93, jnp.nan])
+    once, often = after((AS_IS, True), promised=promised), after(*[(AS_IS, True)] * 5, promised=promised)
+    assert trust.choice(trust.begin(), promised) == CORRECTED
+    assert trust.choice(once, promised) == trust.choice(often, promised) == AS_IS
+    assert trust.expected(often, promised)[AS_IS] > trust.expected(once, promised)[AS_IS] + 0.05
 
 
 def test_without_a_promise_only_the_record_changes():
