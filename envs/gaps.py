@@ -13,7 +13,7 @@ import itertools
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
@@ -124,6 +124,14 @@ def each(sources: Iterable[str]) -> tuple[str, ...]:
         content = {} if match is None or match[2] else read_file(source)
         single += [f"{source}:{name}" for name in content] if len(content) > 1 else [source]
     return tuple(single)
+
+
+def by_scene[T](systems: Iterable[T], scene: Callable[[T], str]) -> list[list[T]]:
+    """Real systems in the groups that one program can step: those of one scene, in the order of the first ones."""
+    groups: dict[str, list[T]] = {}
+    for system in systems:
+        groups.setdefault(scene(system), []).append(system)
+    return list(groups.values())
 
 
 def title(source: str) -> str:

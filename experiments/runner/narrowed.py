@@ -11,8 +11,7 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Env
-from envs.gaps import Gap
+from envs.base import Env, World
 from envs.mujoco.worlds import choose_impl
 from envs.types import Array, Key
 from experiments.runner.diagnose_run import names_of
@@ -23,6 +22,7 @@ from sgft_jax.io.real import Played
 from sgft_jax.posterior.candidates import Unknown, unknowns_of, values
 from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
+from sgft_jax.stacking import member
 
 _DRAWS = 1000  # points of a posterior that say how wide it is
 _SHOWN = 6
@@ -57,19 +57,20 @@ def narrowed(run: FinetuneArgs, home: Path) -> Narrowed:
     labels = [_label(env, unknowns[i]) for i in best]
     scale = np.array([scale for _, scale in labels])
     bounds = np.moveaxis(np.quantile(numbers[..., best], (0.1, 0.9), axis=1), 0, -1)
-    known = truth(env, gaps.load(env, run.real[0]), [unknowns[i] for i in best])
+    world = member(gaps.worlds(env, gaps.load(env, run.real[0]), jax.random.key(0), 1), 0)
+    known = truth(env, world, [unknowns[i] for i in best])
     return Narrowed([name for name, _ in labels], scale * known, scale[:, None] * bounds)
 
 
-def truth(env: Env, real: Gap, unknowns: Sequence[Unknown]) -> np.ndarray:
+def truth(env: Env, world: World, unknowns: Sequence[Unknown]) -> np.ndarray:
     """[k] what is true of a real system."""
-    theta = gaps.worlds(env, real, jax.random.key(0), 1).theta
-    params = dict(zip((p.name for p in env.parameters), theta.params[0], strict=True))
+    theta = world.theta
+    params = dict(zip((p.name for p in env.parameters), theta.params, strict=True))
 
     def value(unknown: Unknown) -> float:
         if unknown.name in params:
             return float(params[unknown.name])
-        return float(np.ravel(getattr(theta.effects.low, unknown.name)[0])[unknown.index])
+        return float(np.ravel(getattr(theta.effects.low, unknown.name))[unknown.index])
 
     return np.array([value(unknown) for unknown in unknowns])
 

@@ -50,12 +50,9 @@ def is_stepped(real: str) -> bool:
 
 
 def by_scene(task: str, reals: Sequence[str]) -> list[tuple[str, ...]]:
-    """Real systems in the groups that one program can step: those of one scene, in the order of the first ones."""
-    groups: dict[str, tuple[str, ...]] = {}
-    for real in reals:
-        scene = "" if is_stepped(real) else gaps.find(task, real).scene
-        groups[scene] = (*groups.get(scene, ()), real)
-    return list(groups.values())
+    """What `--real` names, in the groups that one program can step; see `gaps.by_scene`."""
+    groups = gaps.by_scene(reals, lambda real: "" if is_stepped(real) else gaps.find(task, real).scene)
+    return [tuple(group) for group in groups]
 
 
 def title(real: str) -> str:

@@ -70,8 +70,7 @@ def run(args: "DrawArgs", seeds: list[int], folders: list[Path]) -> tuple[list[G
 
 def _together(env: Env, drawn: Sequence[Gap]) -> list[list[Gap]]:
     """The gaps of each scene, as they are halfway where sensors drift: one program plays those of one scene."""
-    scenes = dict.fromkeys(gap.scene for gap in drawn)
-    return [[_halfway(env, gap) for gap in drawn if gap.scene == scene] for scene in scenes]
+    return [[_halfway(env, gap) for gap in group] for group in gaps.by_scene(drawn, lambda gap: gap.scene)]
 
 
 def _halfway(env: Env, gap: Gap) -> Gap:

@@ -38,7 +38,7 @@ from sgft_jax.posterior.candidates import Candidates, candidates, point_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, play
 from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.posterior.learning import MOST
-from sgft_jax.stacking import stack
+from sgft_jax.stacking import member, stack
 
 _POINTS = 256  # of a posterior
 _DECIDED = 32  # systems in which that is deployed which is chosen
@@ -244,9 +244,10 @@ def _real(args: PosteriorArgs, setup: Setup, key: Key) -> _Real:
     drawn = [gaps.load(setup.env, source) for source in gaps.each(sources)]
     env = real_env(setup.env, drawn)
     with doing(f"compiling {len(drawn)} real systems of {setup.env.name}", 40):
-        unknowns = setup.systems.unknowns
-        points = jnp.stack([point_of(unknowns, jnp.asarray(truth(setup.env, gap, unknowns))) for gap in drawn])
-        return _Real(env, real_worlds(env, drawn, key), [gap.name for gap in drawn], points)
+        pool, unknowns = real_worlds(env, drawn, key), setup.systems.unknowns
+        firsts = [member(member(pool, i), 0) for i in range(len(drawn))]
+        points = jnp.stack([point_of(unknowns, jnp.asarray(truth(setup.env, world, unknowns))) for world in firsts])
+        return _Real(env, pool, [gap.name for gap in drawn], points)
 
 
 def _success(setup: Setup, real: _Real, deployed: Distortion, which: Array, key: Key, *, episodes: int) -> Array:

@@ -300,6 +300,7 @@ def shrinking(path: Path, names: Sequence[str], truth: np.ndarray, intervals: np
         axes.set_yticks(heights, [f"{n} rollouts" if n != 1 else "1 rollout" for n in heights])
         axes.set_ylim(len(heights) - 0.5, -0.5)
         axes.tick_params(labelleft=i % columns == 0)
+        axes.locator_params(axis="x", nbins=5)
         _name(axes, name)
     return _save(figure, path, title)
 

@@ -110,7 +110,7 @@ def deployed(inner: Finetuner, env: Env, systems: Candidates, policy: Policy, *,
             return state._replace(agent=inner.observe(state.agent, rows, valid, None))
         trust = told(state.trust, state.which, state.agent.interface.promised, score > 0.5)
         agent = inner.observe(state.agent, rows, valid, score)
-        # What learns acts behind the correction too, unless the prior as it is is expected to do better without.
+        # What learns acts behind the correction too, unless the prior as it is should do better without it.
         which, known = choice(trust, agent.interface.promised), agent.interface
         distortion = jax.tree.map(lambda a, b: jnp.where(which == CORRECTED, a, b), known.distortion, nothing)
         return Deployed(agent._replace(interface=known._replace(distortion=distortion)), state.first, trust, which)

@@ -26,7 +26,7 @@ _SURE = 0.15  # no promise is surer than this of success or failure
 _WON, _LOST = 1.0, 0.5  # imagined rollouts of the prior as it is
 _DOUBT, _HALF = 1.5, 0.5  # imagined rollouts behind a correction of a wrong simulator, half as good as these
 _CREDIT = 1.0  # imagined rollouts of what learns, half way between the better of the two and success
-_TIMES = 1.2  # what replaces a policy must be so many times as good: one that works may lose more than one that fails
+_TIMES = 1.2  # what replaces a policy must be so many times as good: one that works has more to lose
 _WORKS = 0.5  # a correction must promise so much: where none works in any system, none of them is the real one
 _PROMISE = 4.0  # rollouts that a promise counts as, beside those that a policy has played
 _FADE = 0.9  # what learns has changed: so many times its rollouts count
@@ -66,7 +66,7 @@ def faded(trust: Trust) -> Trust:
 def expected(trust: Trust, promised: Array) -> Array:
     """[3] the success to expect of the policies. promised: [3] by the simulator, nan where it has not tried one."""
     right, records = jnp.minimum(jax.nn.sigmoid(trust.log_odds), _MOST), _records(trust)
-    seen = (_PROMISE * promised + trust.won) / (_PROMISE + trust.won + trust.lost)
+    seen = _mean(trust, promised, _PROMISE)
     return jnp.where(jnp.isnan(promised), records, right * seen + (1.0 - right) * records)
 
 
@@ -81,12 +81,12 @@ def choice(trust: Trust, promised: Array) -> Array:
 
 def _records(trust: Trust) -> Array:
     """[3] by real rollouts alone."""
-    as_is = (trust.won[AS_IS] + _WON) / (trust.won[AS_IS] + trust.lost[AS_IS] + _WON + _LOST)
-    corrected = _mean(trust, CORRECTED, _HALF * as_is, _DOUBT)
-    learned = _mean(trust, LEARNED, (1.0 + jnp.maximum(as_is, corrected)) / 2.0, _CREDIT)
+    as_is = _mean(trust, _WON / (_WON + _LOST), _WON + _LOST)[AS_IS]
+    corrected = _mean(trust, _HALF * as_is, _DOUBT)[CORRECTED]
+    learned = _mean(trust, (1.0 + jnp.maximum(as_is, corrected)) / 2.0, _CREDIT)[LEARNED]
     return jnp.stack([as_is, corrected, learned])
 
 
-def _mean(trust: Trust, which: int, usual: Array, weight: float) -> Array:
-    """[] of a policy's rollouts and of so many imagined ones, usual: [] as successful as that."""
-    return (trust.won[which] + weight * usual) / (trust.won[which] + trust.lost[which] + weight)
+def _mean(trust: Trust, usual: Array | float, weight: float) -> Array:
+    """[3] success in the policies' rollouts and in so many imagined ones. usual: [3] or [] that of the latter."""
+    return (trust.won + weight * usual) / (trust.won + trust.lost + weight)
