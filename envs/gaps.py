@@ -24,8 +24,8 @@ from envs.base import COMMANDS, WHOLE, Effects, Env, Numbers, Value, World
 from envs.files import parse_json, read_json, read_toml
 from envs.types import Array, Key, UserError, unknown
 
-__all__ = ["Gap", "changes", "drifts", "each", "find", "from_dict", "load", "presets", "read_file", "title", "to_toml"]
-__all__ += ["usual", "worlds"]
+__all__ = ["Gap", "by_scene", "changes", "drifts", "each", "find", "from_dict", "load", "presets", "read_file", "title"]
+__all__ += ["to_toml", "usual", "worlds"]
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
 _TABLES = ("params", "effects", "commands", "drift")
