@@ -1,7 +1,8 @@
 """Give priors an estimator: a network that says which systems may have made real rollouts, for method `posterior`.
 
 It learns in simulation alone: systems are drawn from what a real one may be, and the priors' policies play ten rollouts
-in each. Priors that play one task share what is learned. Some minutes on a GPU.
+in each, on a GPU a quarter of them in MuJoCo's own engine. Priors that play one task share what is learned. Some
+minutes on a GPU.
 """
 
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ class EstimateArgs:
 
     prior: Path
     """Folder of a prior, or of several (prior/seed-*), which are written anew with it."""
-    lessons: int = 33_792
+    lessons: int = 67_584
     """Simulated systems to learn from, ten rollouts each."""
     updates: int = 2500
     """Updates for each number of rollouts that are read together: one, two, four and ten."""
@@ -43,7 +44,7 @@ def main(args: EstimateArgs) -> None:
         check_prior(folder, get_method("posterior"), extend.name_of(task))
     import envs
     from envs.mujoco.worlds import choose_impl
-    from experiments.runner.estimating import learned
+    from experiments.runner.estimating import Simulator, learned
     from sgft_jax.io.priors import load_priors, save_prior, variant_of
     from sgft_jax.models.config import network_of
     from sgft_jax.policies import sac_policy
@@ -51,14 +52,16 @@ def main(args: EstimateArgs) -> None:
     from sgft_jax.posterior.interface import entry_of
     from sgft_jax.types import Prior
 
-    env = envs.make(task, choose_impl(args.impl), **variant_of(folders))
+    engines = dict.fromkeys((choose_impl(args.impl), "c"))
+    made = [envs.make(task, engine, **variant_of(folders)) for engine in engines]
+    env = made[0]
     priors, entry = load_priors(folders, env, estimators=True), entry_of(env)
     policy = sac_policy(env.obs_dim, env.act_dim, network_of(priors[0].card))
     with doing(f"compiling the simulator and worlds of {env.name}", 40, once=True):
         env.prepare()
-        systems = candidates(env)
+        simulators = [Simulator(env, candidates(env)) for env in made]
     params = [prior.params for prior in priors]
-    estimator, gained = learned(env, systems, policy, params, lessons=args.lessons, updates=args.updates)
+    estimator, gained = learned(simulators, policy, params, lessons=args.lessons, updates=args.updates)
     for folder, prior in zip(folders, priors, strict=True):
         card = {**prior.card, "estimator": entry}
         print(save_prior(folder, Prior(prior.params._replace(estimator=estimator), card)))

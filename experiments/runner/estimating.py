@@ -1,65 +1,100 @@
 """Impure: an estimator of a task's systems learns from simulation."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Env
-from envs.types import Array, Policy, PyTree
+from envs.types import Array, Key, Policy, PyTree
 from experiments.runner.ahead import compiling
 from experiments.runner.progress import doing, far
 from sgft_jax.posterior.candidates import Candidates
-from sgft_jax.posterior.estimator import Estimator, at_half_precision, log_density
-from sgft_jax.posterior.learning import MOST, TOGETHER, Lessons, begin, learn, simulate
+from sgft_jax.posterior.estimator import MOST, Estimator, at_half_precision, log_density
+from sgft_jax.posterior.learning import TOGETHER, Lessons, begin, finish, learn, simulate
 from sgft_jax.stacking import join
 
 _SEED = 1_000_000
 _AT_ONCE = 3072  # systems that are simulated in one program, each with `MOST` rollouts
+_SECOND = 4  # one in so many programs runs in the second engine
 _TURNS = 50  # into how many calls the updates are divided
-_TEST = 256  # systems that it has not learned from
+_FRESH, _TEST = 1024, 256  # systems that it has not learned from: to finish it, and to judge it
+
+
+class Simulator(NamedTuple):
+    """A task in a physics engine, and its systems there."""
+
+    env: Env
+    systems: Candidates
 
 
 def learned(
-    env: Env, systems: Candidates, policy: Policy, params: Sequence[PyTree], *, lessons: int, updates: int
+    simulators: Sequence[Simulator], policy: Policy, params: Sequence[PyTree], *, lessons: int, updates: int
 ) -> tuple[Estimator, dict[int, float]]:
     """An estimator that has learned from so many systems, `updates` times for each number of rollouts that are read
-    together, and by how many nats so many rollouts make it surer of other systems. params: of the priors whose policies
-    play in turn.
+    together, and by how many nats so many rollouts make it surer of other systems.
+
+    simulators: of one task in one or two engines; the second makes a quarter of the systems. Real contacts are those of
+    no engine, so it must not know one by heart. params: of the priors whose policies play in turn.
     """
     key_play, key_start, key_learn = jax.random.split(jax.random.key(_SEED), 3)
     size, per_call = min(lessons, _AT_ONCE), max(1, updates // _TURNS)
-    parts = -(-lessons // size)
-    some = jax.jit(lambda params, key: simulate(env, systems, policy, params, key, size))
-    test = jax.jit(lambda key: simulate(env, systems, policy, params[0], key, min(size, _TEST)))
+    parts, name = -(-lessons // size), simulators[0].env.name
     start = jax.jit(begin)
     steps = {
         n: jax.jit(functools.partial(learn, together=n, updates=per_call, total=updates), donate_argnums=0)
         for n in TOGETHER
     }
     with compiling() as ahead:
-        with doing(f"simulating {parts * size * MOST} rollouts of {env.name} to learn from", 100):
-            first = some(params[0], key_play)
-            shape = jax.eval_shape(begin, key_start, first)
-            whole = jax.tree.map(lambda x: jax.ShapeDtypeStruct((parts * x.shape[0], *x.shape[1:]), x.dtype), first)
+        with doing(f"simulating {parts * size * MOST} rollouts of {name} to learn from", 100):
+            programs = [_program(simulator, policy, size) for simulator in simulators]
+            taught = [programs[0](params[0], key_play)]
+            shape = jax.eval_shape(begin, key_start, taught[0])
+            whole = jax.tree.map(lambda x: jax.ShapeDtypeStruct((parts * x.shape[0], *x.shape[1:]), x.dtype), taught[0])
             for step in steps.values():
                 ahead.promise(step, lambda: (shape, whole, key_learn))
-            taught = [jax.block_until_ready(first)]
             for i in range(1, parts):
-                taught.append(jax.block_until_ready(some(params[i % len(params)], jax.random.fold_in(key_play, i))))
+                program = programs[i % _SECOND == 1 and len(programs) > 1]
+                taught.append(program(params[i % len(params)], jax.random.fold_in(key_play, i)))
+                jax.block_until_ready(taught[max(0, i - _SECOND)])  # two engines work beside each other
                 far((i + 1) / parts)
-        learning, seen, count = start(key_start, first), join(taught), -(-updates // per_call)
-        with doing(f"learning which systems of {env.name} make which rollouts", 100):
+            seen = jax.tree.map(jnp.asarray, join(jax.device_get(taught)))
+        count = -(-updates // per_call)
+        with doing(f"learning which systems of {name} make which rollouts", 100):
+            learning = start(key_start, seen)
             ahead.wait(*steps.values())
             for i in range(count):
                 for n, step in steps.items():
                     learning = step(learning, seen, jax.random.fold_in(jax.random.fold_in(key_learn, i), n))
                 jax.block_until_ready(learning)
                 far((i + 1) / count)
-        estimator = at_half_precision(learning.estimator)  # what is saved is what is judged
-        return estimator, _gained(estimator, test(jax.random.fold_in(key_play, parts)))
+        with doing(f"checking how sure of systems of {name} it may be", 60):
+            key_fresh, key_test = jax.random.split(jax.random.fold_in(key_play, parts))
+            others = functools.partial(_others, simulators, policy, params[0])
+            complete = jax.jit(finish)(learning.estimator, others(key_fresh, min(size, _FRESH)), key_fresh)
+            estimator = at_half_precision(complete)  # what is saved is what is judged
+            return estimator, _gained(estimator, others(key_test, min(size, _TEST)))
+
+
+def _program(simulator: Simulator, policy: Policy, n: int) -> Callable[[PyTree, Key], Lessons]:
+    """Rollouts in n systems. MuJoCo's own engine runs on the host, with the policy, beside what a GPU does."""
+    program = jax.jit(lambda params, key: simulate(*simulator, policy, params, key, n))
+    if simulator.env.impl != "c":
+        return program
+    host = jax.local_devices(backend="cpu")[0]
+    return lambda *args: program(*jax.device_put(args, host))
+
+
+def _others(simulators: Sequence[Simulator], policy: Policy, params: PyTree, key: Key, n: int) -> Lessons:
+    """Systems from all simulators alike, n of them or a few less."""
+    few = max(1, n // len(simulators))
+    lessons = [
+        _program(simulator, policy, few)(params, jax.random.fold_in(key, i)) for i, simulator in enumerate(simulators)
+    ]
+    return jax.tree.map(jnp.asarray, join(jax.device_get(lessons)))
 
 
 def _gained(estimator: Estimator, lessons: Lessons) -> dict[int, float]:

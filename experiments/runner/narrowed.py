@@ -20,8 +20,7 @@ from experiments.runner.options import episodes_of
 from sgft_jax.io.priors import load_prior, variant
 from sgft_jax.io.real import Played
 from sgft_jax.posterior.candidates import Unknown, unknowns_of, values
-from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
-from sgft_jax.posterior.learning import MOST
+from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.stacking import member
 
 _DRAWS = 1000  # points of a posterior that say how wide it is

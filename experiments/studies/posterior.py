@@ -36,8 +36,7 @@ from sgft_jax.io.priors import load_prior, variant
 from sgft_jax.models.distortion import Distortion, none
 from sgft_jax.posterior.candidates import Candidates, candidates, point_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, play
-from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
-from sgft_jax.posterior.learning import MOST
+from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.stacking import member, stack
 
 _POINTS = 256  # of a posterior

@@ -20,10 +20,12 @@ from envs.base import Env
 from envs.types import Array, Key, PyTree, Transition
 
 _WIDTH, _HEADS, _STEPS, _ROLLOUTS = 128, 4, 3, 2  # of the encoder: units, heads, layers over steps and over rollouts
-_BINS, _HIDDEN = 64, 256  # of a histogram, and units of the network that fills it
+_BINS, _HIDDEN = 256, 256  # of a histogram, and units of the network that fills it
 _WAVES = 6  # pairs of sine and cosine by which a number is read
 _SCALE = 4.0  # std of a measurement within which its waves tell places apart
+_HALF = 64  # points of the posterior of half of the rollouts
 _MANY = 4.0  # rollouts, for scale
+MOST = 10  # rollouts that are read together
 _FARTHEST = 10.0  # std: beyond it a number is cut off
 _LEAST = 1e-4  # raw units: std of a measurement
 
@@ -50,10 +52,16 @@ class Statistics(NamedTuple):
 
 
 class Estimator(NamedTuple):
-    """What a trained network needs: its params and the statistics of what it reads."""
+    """What a trained network needs: its params and the statistics of what it reads.
+
+    temper: [d] by how much the logits of each number are multiplied. usual: [MOST] the `contradiction` of 1, 2, ...
+    rollouts that 95 % of the simulator's systems do not exceed. `learning.finish` fits both.
+    """
 
     params: PyTree
     statistics: Statistics
+    temper: Array
+    usual: Array
 
 
 class _Block(nn.Module):
@@ -127,7 +135,7 @@ def without_estimator(params: PyTree) -> PyTree:
 
 def shaped(steps: int, measured: int, act_dim: int, d: int) -> Estimator:
     """Zeros of the shapes that an estimator has for rollouts of so many steps, measurements and actions."""
-    rollouts = jax.tree.map(lambda x: x[None], blank(1, steps, measured, act_dim))
+    rollouts = jax.tree.map(lambda x: x[None], blank(MOST, steps, measured, act_dim))
     shapes = jax.eval_shape(lambda: init(jax.random.key(0), rollouts, d))
     return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
 
@@ -140,15 +148,25 @@ def init(key: Key, rollouts: Rollout, d: int) -> Estimator:
     encoder = _Encoder().init(key_encoder, *inputs)
     nothing = jnp.zeros(d)
     head = _Head().init(key_head, _Encoder().apply(encoder, *inputs), nothing, nothing)
-    return Estimator({"encoder": encoder, "head": head}, statistics)
+    return Estimator({"encoder": encoder, "head": head}, statistics, jnp.ones(d), jnp.zeros(rollouts.success.shape[1]))
 
 
 def log_density(estimator: Estimator, rollouts: Rollout, counts: Array, point: Array) -> Array:
     """[d] nats of each number of a point [d], given those before it. rollouts: [k], of which counts [k] bool count."""
+    return at(histograms(estimator, rollouts, counts, point), point)
+
+
+def histograms(estimator: Estimator, rollouts: Rollout, counts: Array, point: Array) -> Array:
+    """[d, bins] nats of the density of each number, given those of a point [d] before it."""
     d, fill = len(point), _fill(estimator, rollouts, counts)
     before = jnp.where(jnp.tril(jnp.ones((d, d), bool), -1), point, 0.0)
+    return jax.vmap(fill)(before, jnp.eye(d))
+
+
+def at(histograms: Array, point: Array) -> Array:
+    """[d] what histograms [d, bins] hold at a point [d]."""
     bins = jnp.clip(jnp.floor(point * _BINS).astype(jnp.int32), 0, _BINS - 1)
-    return jax.vmap(fill)(before, jnp.eye(d))[jnp.arange(d), bins]
+    return histograms[jnp.arange(len(point)), bins]
 
 
 def draw(estimator: Estimator, rollouts: Rollout, counts: Array, d: int, key: Key, n: int) -> Array:
@@ -167,13 +185,31 @@ def draw(estimator: Estimator, rollouts: Rollout, counts: Array, d: int, key: Ke
     return jax.vmap(one)(jax.random.split(key, n))
 
 
+def contradiction(estimator: Estimator, rollouts: Rollout, counts: Array, d: int, key: Key) -> Array:
+    """[] nats by which systems are less probable to one half of the rollouts than to the other, from which they are
+    drawn. Large where no system has made them all; small for one rollout. Arguments as of `log_density`.
+    """
+    first = counts & (jnp.cumsum(counts) % 2 == 1)
+
+    def one_way(here: Array, there: Array, key: Key) -> Array:
+        def nats(counts: Array, point: Array) -> Array:
+            return log_density(estimator, rollouts, counts, point).sum()
+
+        points = draw(estimator, rollouts, here, d, key, _HALF)
+        of_points = jax.vmap(nats, (None, 0))
+        return jnp.mean(of_points(here, points) - of_points(there, points))
+
+    keys, second = jax.random.split(key), counts & ~first
+    return (one_way(first, second, keys[0]) + one_way(second, first, keys[1])) / 2
+
+
 def _fill(estimator: Estimator, rollouts: Rollout, counts: Array) -> Callable[[Array, Array], Array]:
     """What fills histograms: (numbers so far [d], which one is next [d]) -> [bins] nats of its density."""
     context = _Encoder().apply(estimator.params["encoder"], *_read(estimator.statistics, rollouts, counts))
 
     def fill(before: Array, which: Array) -> Array:
         logits = cast(Array, _Head().apply(estimator.params["head"], context, before, which))
-        return jax.nn.log_softmax(logits) + math.log(_BINS)
+        return jax.nn.log_softmax(estimator.temper @ which * logits) + math.log(_BINS)
 
     return fill
 

@@ -15,8 +15,7 @@ from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.models.distortion import Distortion, Interface, Seen, none
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose, judged
-from sgft_jax.posterior.estimator import Estimator, Rollout, blank, draw, rollout_of
-from sgft_jax.posterior.learning import MOST
+from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, contradiction, draw, rollout_of
 from sgft_jax.posterior.trust import AS_IS, CORRECTED, LEARNED, POLICIES, Trust, begin, choice, expected, faded, told
 from sgft_jax.stacking import member, stack
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
@@ -27,7 +26,8 @@ class Believed(NamedTuple):
 
     params: of the policy that plays in simulation, without an estimator. rollouts: [MOST] the last ones, and `count` []
     how many there have been. judges: [JUDGES, d] systems that may be the real one. distortion: what the policy that
-    is chosen corrects, and the one that learns. promised: [3] the success that simulation promises for the policies of
+    is chosen corrects, and the one that learns. contradicted: [] bool, whether rollouts contradict each other more than
+    those of the simulator's systems do. promised: [3] the success that simulation promises for the policies of
     `trust`, nan for those that it has not tried. key: of all choices.
     """
 
@@ -37,6 +37,7 @@ class Believed(NamedTuple):
     count: Array
     judges: Array
     distortion: Distortion
+    contradicted: Array
     promised: Array
     key: Key
 
@@ -61,9 +62,8 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interf
         if params.estimator is None:
             raise UserError("this prior has no estimator of systems; `python -m experiments.estimate` makes it")
         acting, judges = _acting(params), jnp.zeros((JUDGES, len(systems.unknowns)))
-        return Believed(
-            acting, params.estimator, room, jnp.int32(0), judges, nothing, jnp.full(3, jnp.nan, jnp.float32), key
-        )
+        promised, contradicted = jnp.full(3, jnp.nan, jnp.float32), jnp.zeros((), bool)
+        return Believed(acting, params.estimator, room, jnp.int32(0), judges, nothing, contradicted, promised, key)
 
     def refit(known: Believed, seen: Seen) -> Believed:
         if seen.rollout is None:  # of a log, which does not tell success
@@ -74,8 +74,13 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy) -> Interf
         counts, (key_points, key_choice) = jnp.arange(MOST) < known.count, _keys(known)
         points = draw(known.estimator, rollouts, counts, len(systems.unknowns), key_points, CANDIDATES + JUDGES)
         distortion, promised = choose(env, systems, policy, known.params, points, key_choice)
-        promised = jnp.append(promised, jnp.nan)
-        return known._replace(judges=points[CANDIDATES:], distortion=distortion, promised=promised)
+        nats = contradiction(known.estimator, rollouts, counts, len(systems.unknowns), key_choice)
+        return known._replace(
+            judges=points[CANDIDATES:],
+            distortion=distortion,
+            contradicted=(known.count > 1) & (nats > known.estimator.usual[jnp.minimum(known.count, MOST) - 1]),
+            promised=jnp.append(promised, jnp.nan),
+        )
 
     return Interface(start, lambda known, simulated: known, refit)
 
@@ -85,7 +90,8 @@ def deployed(inner: Finetuner, env: Env, systems: Candidates, policy: Policy, *,
 
     inner: identifies by `posterior_interface`; its exported params act by `policy`. learns: whether it also learns.
     `learn` must follow each rollout once, as in `finetuning.finetune`. Metrics: posterior/deployed, the number of the
-    policy of `trust`, and the success that is expected of each.
+    policy of `trust`, the success that is expected of each, and posterior/contradicted, 1 where no system of the
+    simulator is the real one.
     """
     nothing = none(env.act_dim, env.measured_dim)
 
@@ -110,6 +116,7 @@ def deployed(inner: Finetuner, env: Env, systems: Candidates, policy: Policy, *,
             return state._replace(agent=inner.observe(state.agent, rows, valid, None))
         trust = told(state.trust, state.which, state.agent.interface.promised, score > 0.5)
         agent = inner.observe(state.agent, rows, valid, score)
+        trust = trust._replace(contradicted=agent.interface.contradicted)
         # What learns acts behind the correction too, unless the prior as it is should do better without it.
         which, known = choice(trust, agent.interface.promised), agent.interface
         distortion = jax.tree.map(lambda a, b: jnp.where(which == CORRECTED, a, b), known.distortion, nothing)
@@ -134,7 +141,8 @@ def deployed(inner: Finetuner, env: Env, systems: Candidates, policy: Policy, *,
             known = known._replace(promised=known.promised.at[LEARNED].set(promise))
         which = choice(trust, known.promised)
         metrics |= {f"posterior/{n}": x for n, x in zip(POLICIES, expected(trust, known.promised), strict=True)}
-        metrics |= {"posterior/deployed": which.astype(jnp.float32)}
+        facts = {"deployed": which, "contradicted": trust.contradicted}
+        metrics |= {f"posterior/{name}": x.astype(jnp.float32) for name, x in facts.items()}
         return Deployed(agent._replace(interface=known), state.first, trust, which), metrics
 
     changed = {"init": init, "prepare": prepare, "act": act, "observe": observe, "learn": learn, "export": export}

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.base import Env
 from envs.types import Array, Key, Policy, PyTree
@@ -11,15 +12,27 @@ from sgft_jax.math import optim
 from sgft_jax.models.distortion import none
 from sgft_jax.posterior.candidates import Candidates
 from sgft_jax.posterior.decision import correction, play
-from sgft_jax.posterior.estimator import Estimator, Rollout, Statistics, init, log_density, rollout_of
+from sgft_jax.posterior.estimator import (
+    MOST,
+    Estimator,
+    Rollout,
+    at,
+    contradiction,
+    histograms,
+    init,
+    log_density,
+    rollout_of,
+)
 
-MOST = 10  # rollouts that are read together
 TOGETHER = (1, 2, 4, MOST)  # how many an update reads; each number in its turn
 _BATCH = 1024  # rollouts of an update
 _RATE, _WARMUP, _GRADIENT = 5e-4, 500, 1.0  # Adam's, the updates until it is reached, and the largest norm
 _PLAIN, _NEAR = 0.5, 0.35  # shares of rollouts without a correction, and with one that is nearly right
 _NEARLY, _WRONG = 0.12, 0.5  # std of what corrections miss, in units of the cube
 _EXPLORES = 0.5  # share of rollouts that explore, as training rollouts do
+
+_USUAL = 0.95  # share of systems whose rollouts contradict each other less than that
+_TEMPERS = np.geomspace(0.25, 4.0, 41)
 
 _OPTIMISER = optim.adam(_GRADIENT)
 
@@ -32,15 +45,15 @@ class Lessons(NamedTuple):
 
 
 class Learning(NamedTuple):
-    """An estimator that learns."""
+    """An estimator that learns. fresh: what it began with, beside its params."""
 
     fit: optim.Fit
-    statistics: Statistics
+    fresh: Estimator
 
     @property
     def estimator(self) -> Estimator:
         """As it is now."""
-        return Estimator(self.fit.params, self.statistics)
+        return self.fresh._replace(params=self.fit.params)
 
 
 def simulate(env: Env, systems: Candidates, policy: Policy, params: PyTree, key: Key, n: int) -> Lessons:
@@ -68,7 +81,7 @@ def simulate(env: Env, systems: Candidates, policy: Policy, params: PyTree, key:
 def begin(key: Key, lessons: Lessons) -> Learning:
     """Before the first update."""
     fresh = init(key, lessons.rollouts, lessons.points.shape[1])
-    return Learning(optim.start(_OPTIMISER, fresh.params), fresh.statistics)
+    return Learning(optim.start(_OPTIMISER, fresh.params), fresh._replace(params=()))
 
 
 def learn(learning: Learning, lessons: Lessons, key: Key, *, together: int, updates: int, total: int) -> Learning:
@@ -86,10 +99,42 @@ def learn(learning: Learning, lessons: Lessons, key: Key, *, together: int, upda
         rate = _RATE * optim.warmup_factor(step, min(_WARMUP, whole / 10)) * optim.cosine_factor(step, whole)
 
         def loss(params: PyTree) -> tuple[Array, None]:
-            estimator = Estimator(params, learning.statistics)
+            estimator = learning.fresh._replace(params=params)
             nats = jax.vmap(lambda *x: log_density(estimator, x[0], counts, x[1]))(rollouts, lessons.points[systems])
             return -nats.sum(axis=1).mean(), None
 
         return learning._replace(fit=optim.minimise(_OPTIMISER, loss, learning.fit, rate)[0]), None
 
     return jax.lax.scan(update, learning, jax.random.split(key, updates))[0]
+
+
+def finish(estimator: Estimator, lessons: Lessons, key: Key) -> Estimator:
+    """The same with what lessons tell that it has not learned from: how sure of each number it may be, and how much
+    rollouts of one system contradict each other.
+    """
+    tempered = estimator._replace(temper=_temper(estimator, lessons))
+
+    def contradicted(row: tuple[Rollout, Key]) -> Array:
+        def after(n: Array) -> Array:
+            return contradiction(tempered, row[0], jnp.arange(MOST) < n, lessons.points.shape[1], row[1])
+
+        return jax.lax.map(after, 1 + jnp.arange(MOST))
+
+    keys = jax.random.split(key, len(lessons.points))
+    nats = jax.lax.map(contradicted, (lessons.rollouts, keys), batch_size=64)
+    return tempered._replace(usual=jnp.quantile(nats, _USUAL, axis=0))
+
+
+def _temper(estimator: Estimator, lessons: Lessons) -> Array:
+    """[d] what makes these systems most probable (temperature scaling, Guo et al. 2017)."""
+    tempers = jnp.asarray(_TEMPERS, jnp.float32)
+
+    def nats(row: tuple[Array, Rollout]) -> Array:
+        def after(n: int) -> Array:
+            logits = histograms(estimator, row[1], jnp.arange(MOST) < n, row[0])
+            return jax.vmap(lambda temper: at(jax.nn.log_softmax(temper * logits), row[0]))(tempers)
+
+        return jnp.stack([after(n) for n in TOGETHER]).sum(axis=0)
+
+    best = jax.lax.map(nats, (lessons.points, lessons.rollouts), batch_size=64).sum(axis=0).argmax(axis=0)
+    return estimator.temper * tempers[best]

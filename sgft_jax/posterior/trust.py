@@ -5,7 +5,8 @@ what learns. Either the simulator is right about them, then a rollout succeeds a
 four rollouts, or it says nothing, then only what a policy did in real rollouts counts. Every rollout changes how
 probable the first is (Bayes' rule), by how well it was promised. So under a misfit promises fade to the policies' own
 records, and simulation can neither veto nor promote; and what learns is tried where the others fail, whatever
-simulation says.
+simulation says. Where halves of the rollouts contradict each other, none of the simulator's systems is the real one,
+and only records count at once.
 
 tests/sgft_jax/posterior/test_trust.py states the errors, for simulators of several biases.
 """
@@ -33,16 +34,19 @@ _FADE = 0.9  # what learns has changed: so many times its rollouts count
 
 
 class Trust(NamedTuple):
-    """log_odds: [] that the simulator is right. won, lost: [3] real rollouts of the policies."""
+    """log_odds: [] that the simulator is right. won, lost: [3] real rollouts of the policies. contradicted: [] bool,
+    whether no system of the simulator makes rollouts as they were.
+    """
 
     log_odds: Array
     won: Array
     lost: Array
+    contradicted: Array
 
 
 def begin() -> Trust:
     """Before any rollout."""
-    return Trust(jnp.float32(math.log(_RIGHT / (1.0 - _RIGHT))), jnp.zeros(3), jnp.zeros(3))
+    return Trust(jnp.float32(math.log(_RIGHT / (1.0 - _RIGHT))), jnp.zeros(3), jnp.zeros(3), jnp.zeros((), bool))
 
 
 def told(trust: Trust, deployed: Array, promised: Array, success: Array) -> Trust:
@@ -54,7 +58,8 @@ def told(trust: Trust, deployed: Array, promised: Array, success: Array) -> Trus
     sure = jnp.where(jnp.isnan(promise), usual, jnp.clip(promise, _SURE, 1.0 - _SURE))
     gain = jnp.where(success, jnp.log(sure / usual), jnp.log((1.0 - sure) / (1.0 - usual)))
     row = jax.nn.one_hot(deployed, 3)
-    return Trust(trust.log_odds + gain, trust.won + row * success, trust.lost + row * ~success)
+    won, lost = trust.won + row * success, trust.lost + row * ~success
+    return trust._replace(log_odds=trust.log_odds + gain, won=won, lost=lost)
 
 
 def faded(trust: Trust) -> Trust:
@@ -66,6 +71,7 @@ def faded(trust: Trust) -> Trust:
 def expected(trust: Trust, promised: Array) -> Array:
     """[3] the success to expect of the policies. promised: [3] by the simulator, nan where it has not tried one."""
     right, records = jnp.minimum(jax.nn.sigmoid(trust.log_odds), _MOST), _records(trust)
+    right = jnp.where(trust.contradicted, 0.0, right)
     seen = _mean(trust, promised, _PROMISE)
     return jnp.where(jnp.isnan(promised), records, right * seen + (1.0 - right) * records)
 

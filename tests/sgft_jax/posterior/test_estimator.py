@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 
 from sgft_jax.posterior import estimator, learning
-from sgft_jax.posterior.estimator import Estimator, Rollout, draw, init, log_density
-from sgft_jax.posterior.learning import MOST, Lessons
+from sgft_jax.posterior.estimator import MOST, Rollout, contradiction, draw, init, log_density
+from sgft_jax.posterior.learning import Lessons
 
 STEPS, NOISE = 6, 0.5
+BINS = 64
+
+
+@pytest.fixture(autouse=True)
+def _few_bins(monkeypatch):
+    """They are learned in seconds."""
+    monkeypatch.setattr(estimator, "_BINS", BINS)
 
 
 def lessons(key, n):
@@ -34,9 +41,9 @@ def counted(n):
 def test_every_number_has_a_density(key):
     """Whatever the network says, the histogram of a number integrates to one given those before it."""
     one = jax.tree.map(lambda x: x[0], lessons(key, 1).rollouts)
-    middles = (jnp.arange(64) + 0.5) / 64
+    middles = (jnp.arange(BINS) + 0.5) / BINS
     known = fresh(key)
-    points = jnp.stack([jnp.full(64, 0.3), middles], axis=1)
+    points = jnp.stack([jnp.full(BINS, 0.3), middles], axis=1)
     nats = jax.vmap(lambda point: log_density(known, one, counted(3), point))(points)
     assert jnp.exp(nats[:, 1]).mean() == pytest.approx(1.0, abs=1e-4)
     np.testing.assert_allclose(nats[:, 0], nats[0, 0], rtol=1e-5)  # what comes later changes nothing before
@@ -46,10 +53,10 @@ def test_draws_follow_the_density(key):
     one = jax.tree.map(lambda x: x[0], lessons(key, 1).rollouts)
     known = fresh(key)
     sharp = jax.tree.map(lambda x: 3.0 * x, known.params)
-    points = draw(Estimator(sharp, known.statistics), one, counted(2), 2, key, 4000)
-    middles = jnp.stack(jnp.meshgrid(*[(jnp.arange(64) + 0.5) / 64] * 2, indexing="ij"), -1).reshape(-1, 2)
-    nats = jax.vmap(lambda point: log_density(Estimator(sharp, known.statistics), one, counted(2), point))(middles)
-    weights = jnp.exp(nats.sum(1)) / 64**2
+    points = draw(known._replace(params=sharp), one, counted(2), 2, key, 4000)
+    middles = jnp.stack(jnp.meshgrid(*[(jnp.arange(BINS) + 0.5) / BINS] * 2, indexing="ij"), -1).reshape(-1, 2)
+    nats = jax.vmap(lambda point: log_density(known._replace(params=sharp), one, counted(2), point))(middles)
+    weights = jnp.exp(nats.sum(1)) / BINS**2
     assert weights.sum() == pytest.approx(1.0, abs=1e-3)
     np.testing.assert_allclose(points.mean(0), weights @ middles, atol=0.02)
     np.testing.assert_allclose(points.T @ points / len(points), (weights[None] * middles.T) @ middles, atol=0.02)
@@ -97,6 +104,48 @@ def _exact(measured):
     weights = jax.nn.softmax(jnp.stack(nats, axis=1))
     mean = weights @ grid
     return mean, jnp.sqrt(weights @ grid**2 - mean**2)
+
+
+def test_tempers_undo_what_makes_it_too_sure(key, monkeypatch):
+    """Thrice as sure of the first number as it should be, of the second half as sure."""
+    for name, value in {"_WIDTH": 8, "_HIDDEN": 16, "_STEPS": 1, "_ROLLOUTS": 1}.items():
+        monkeypatch.setattr(estimator, name, value)
+    monkeypatch.setattr(learning, "TOGETHER", (MOST,))
+    data = lessons(key, 1024)
+    known = fresh(key)
+    known = known._replace(params=jax.tree.map(lambda x: 3.0 * x, known.params))
+    truth = jax.vmap(lambda one, key: draw(known, one, counted(MOST), 2, key, 1)[0])
+    data = data._replace(points=truth(data.rollouts, jax.random.split(key, 1024)))
+    wrong = known._replace(temper=jnp.array([3.0, 0.5]))
+    right = jax.jit(learning.finish)(wrong, data, key)
+    np.testing.assert_allclose(right.temper, 1.0, rtol=0.2)
+    nats = jax.jit(lambda one, key: contradiction(right, one, counted(4), 2, key))
+    share = np.mean([nats(jax.tree.map(lambda x, i=i: x[i], data.rollouts), key) > right.usual[3] for i in range(200)])
+    assert share < 0.1
+
+
+def test_halves_of_two_systems_contradict_each_other(key, monkeypatch):
+    """Of a network that reads what it is told: half of the rollouts are high, half are low."""
+    monkeypatch.setattr(estimator, "histograms", lambda known, rollouts, counts, point: read(rollouts, counts))
+    monkeypatch.setattr(
+        estimator,
+        "draw",
+        lambda known, rollouts, counts, d, key, n: jnp.full((n, 1), mean(rollouts, counts)),
+    )
+
+    def mean(rollouts, counts):
+        return jnp.sum(rollouts.measured[:, 0, 0] * counts) / counts.sum()
+
+    def read(rollouts, counts):
+        middles = (jnp.arange(BINS) + 0.5) / BINS
+        return jax.nn.log_softmax(-0.5 * ((middles - mean(rollouts, counts)) / 0.1) ** 2)[None]
+
+    one = jax.tree.map(lambda x: x[0], lessons(key, 1).rollouts)
+    even = jnp.where(jnp.arange(MOST) % 2 == 0, 0.2, 0.8)[:, None, None]
+    for values, wanted in ((jnp.full_like(even, 0.5), 0.0), (even, 0.5 * 6.0**2)):
+        alike = one._replace(measured=jnp.broadcast_to(values, one.measured.shape))
+        nats = estimator.contradiction(fresh(key), alike, counted(6), 1, key)
+        assert nats == pytest.approx(wanted, rel=0.1, abs=1e-4)
 
 
 def test_its_size_is_that_of_a_part_of_a_prior(key):

@@ -133,6 +133,13 @@ def test_simulation_vetoes_what_learns_while_its_promises_are_kept():
     assert trust.choice(known, promised) == CORRECTED
 
 
+def test_rollouts_that_no_system_makes_leave_records_alone():
+    promised = jnp.array([0.3, 0.95, 0.9])
+    known = after((AS_IS, True), promised=promised)
+    assert trust.choice(known, promised) == CORRECTED
+    assert trust.choice(known._replace(contradicted=jnp.array(True)), promised) == AS_IS
+
+
 def test_old_rollouts_of_what_learns_count_less():
     known = after((LEARNED, True), (AS_IS, True))
     aged = trust.faded(known)
