@@ -54,8 +54,8 @@ class Statistics(NamedTuple):
 class Estimator(NamedTuple):
     """What a trained network needs: its params and the statistics of what it reads.
 
-    temper: [d] by how much the logits of each number are multiplied. usual: [MOST] the `contradiction` of 1, 2, ...
-    rollouts that 95 % of the simulator's systems do not exceed. `learning.finish` fits both.
+    temper: [MOST, d] by how much the logits of each number are multiplied after 1, 2, ... rollouts. usual: [MOST] the
+    `contradiction` of so many that 95 % of the simulator's systems do not exceed. `learning.finish` fits both.
     """
 
     params: PyTree
@@ -148,7 +148,8 @@ def init(key: Key, rollouts: Rollout, d: int) -> Estimator:
     encoder = _Encoder().init(key_encoder, *inputs)
     nothing = jnp.zeros(d)
     head = _Head().init(key_head, _Encoder().apply(encoder, *inputs), nothing, nothing)
-    return Estimator({"encoder": encoder, "head": head}, statistics, jnp.ones(d), jnp.zeros(rollouts.success.shape[1]))
+    most = rollouts.success.shape[1]
+    return Estimator({"encoder": encoder, "head": head}, statistics, jnp.ones((most, d)), jnp.zeros(most))
 
 
 def log_density(estimator: Estimator, rollouts: Rollout, counts: Array, point: Array) -> Array:
@@ -206,10 +207,11 @@ def contradiction(estimator: Estimator, rollouts: Rollout, counts: Array, d: int
 def _fill(estimator: Estimator, rollouts: Rollout, counts: Array) -> Callable[[Array, Array], Array]:
     """What fills histograms: (numbers so far [d], which one is next [d]) -> [bins] nats of its density."""
     context = _Encoder().apply(estimator.params["encoder"], *_read(estimator.statistics, rollouts, counts))
+    temper = estimator.temper[jnp.maximum(counts.sum(), 1) - 1]
 
     def fill(before: Array, which: Array) -> Array:
         logits = cast(Array, _Head().apply(estimator.params["head"], context, before, which))
-        return jax.nn.log_softmax(estimator.temper @ which * logits) + math.log(_BINS)
+        return jax.nn.log_softmax(temper @ which * logits) + math.log(_BINS)
 
     return fill
 

@@ -126,15 +126,15 @@ def finish(estimator: Estimator, lessons: Lessons, key: Key) -> Estimator:
 
 
 def _temper(estimator: Estimator, lessons: Lessons) -> Array:
-    """[d] what makes these systems most probable (temperature scaling, Guo et al. 2017)."""
+    """[MOST, d] what makes these systems most probable (temperature scaling, Guo et al. 2017)."""
     tempers = jnp.asarray(_TEMPERS, jnp.float32)
 
     def nats(row: tuple[Array, Rollout]) -> Array:
-        def after(n: int) -> Array:
+        def after(n: Array) -> Array:
             logits = histograms(estimator, row[1], jnp.arange(MOST) < n, row[0])
             return jax.vmap(lambda temper: at(jax.nn.log_softmax(temper * logits), row[0]))(tempers)
 
-        return jnp.stack([after(n) for n in TOGETHER]).sum(axis=0)
+        return jax.lax.map(after, 1 + jnp.arange(MOST))
 
-    best = jax.lax.map(nats, (lessons.points, lessons.rollouts), batch_size=64).sum(axis=0).argmax(axis=0)
+    best = jax.lax.map(nats, (lessons.points, lessons.rollouts), batch_size=64).sum(axis=0).argmax(axis=1)
     return estimator.temper * tempers[best]
