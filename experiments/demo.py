@@ -70,7 +70,7 @@ def plan(args: DemoArgs) -> FinetuneArgs:
     check_folder(args.out)
     shared = {"task": args.task, "prior": args.prior, "out": args.out, "overwrite": True, "real": (args.real,)}
     size = {"seed": args.seed, "seeds": 1, "rollouts": args.rollouts, "eval_every": 1, "eval_episodes": 20}
-    run = arguments(_METHOD, options=get_method(_METHOD).config(learns=False), video=args.video, **shared, **size)
+    run = arguments(_METHOD, options=get_method(_METHOD).config(), video=args.video, **shared, **size)
     priors_of(run)
     check(run)
     return run

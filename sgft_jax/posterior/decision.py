@@ -1,6 +1,7 @@
 """Which policy to deploy: each candidate plays simulated episodes of the systems that may be the real one. Pure.
 
-Candidates are the prior as it is, and the prior behind what undoes a particle's errors of commands and sensors.
+Candidates are the prior as it is, and the prior behind what undoes a particle's errors of commands and sensors, or
+behind corrections that come from elsewhere.
 """
 
 import functools
@@ -61,44 +62,38 @@ def play(env: Env, policy: Policy, params: PyTree, world: World, key: Key, *, ex
 
 
 def choose(
-    env: Env, candidates: Candidates, policy: Policy, params: PyTree, points: Array, key: Key
+    env: Env, candidates: Candidates, policy: Policy, params: PyTree, points: Array, key: Key, *others: Distortion
 ) -> tuple[Distortion, Array]:
-    """Behind which correction to deploy a policy, and the success [2] to expect of it as it is and behind that, by
-    points [CANDIDATES + JUDGES, d] of a posterior. params: what the policy acts by, with a distortion that is replaced.
+    """Behind which correction to deploy a policy, and the success to expect of it as it is, behind that, and behind
+    each of the others [2 + len(others)], by points [CANDIDATES + JUDGES, d] of a posterior.
+
+    params: what the policy acts by, with a distortion that is replaced. others: corrections that are candidates too.
     """
     undo = jax.vmap(lambda point: correction(env, candidates.unknowns, point))(points[:CANDIDATES])
-    acting = join([stack([none(env.act_dim, env.measured_dim)]), undo])
+    acting = join([stack([none(env.act_dim, env.measured_dim), *others]), undo])
 
     def success(distortion: Distortion, world: World, key: Key) -> Array:
         return play(env, policy, params._replace(distortion=distortion), world, key).success
 
-    decision = decide(success, acting, candidates, points[CANDIDATES:], key, episodes=_EPISODES)
-    return member(acting, decision.chosen), jnp.stack([decision.expected[0], decision.promised])
-
-
-def judged(env: Env, candidates: Candidates, policy: Policy, params: PyTree, particles: Array, key: Key) -> Array:
-    """[] success of a policy in the episodes of systems [I, d] in which `choose` with this key judges its finalists."""
-
-    def success(params: PyTree, world: World, key: Key) -> Array:
-        return play(env, policy, params, world, key).success
-
-    key_final = jax.random.split(key)[1]
-    return _table(success, stack([params]), candidates, particles, key_final, episodes=_EPISODES).mean()
+    known = 1 + len(others)
+    decision = decide(success, acting, candidates, points[CANDIDATES:], key, episodes=_EPISODES, known=known)
+    promised = jnp.concatenate([decision.expected[:1], decision.promised[None], decision.expected[1:known]])
+    return member(acting, decision.chosen), promised
 
 
 def decide(
-    trial: Trial, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int
+    trial: Trial, acting: PyTree, candidates: Candidates, particles: Array, key: Key, *, episodes: int, known: int = 1
 ) -> Decision:
     """The candidate of the highest expected success; the prior as it is unless another is clearly better.
 
     acting: [J] candidates, the prior as it is first. particles: [I, d]. Everyone plays one episode in each particle;
-    the best go on with `episodes` fresh ones, by which they are judged, so that luck is not promised. All play the
-    same episodes: their differences are paired.
+    the first `known` and the best of the others go on with `episodes` fresh ones, by which they are judged, so that
+    luck is not promised. All play the same episodes: their differences are paired.
     """
     key_first, key_final = jax.random.split(key)
     first = _table(trial, acting, candidates, particles, key_first, episodes=1)
-    best = 1 + jax.lax.top_k(first[1:].mean(axis=1), min(_FINALISTS, len(first) - 1))[1]
-    finalists = jnp.concatenate([jnp.zeros(1, best.dtype), best])
+    best = known + jax.lax.top_k(first[known:].mean(axis=1), min(_FINALISTS, len(first) - known))[1]
+    finalists = jnp.concatenate([jnp.arange(known, dtype=best.dtype), best])
     table = _table(trial, member(acting, finalists), candidates, particles, key_final, episodes=episodes)
     gains = table - table[:1]
     error = gains.std(axis=1) / np.sqrt(len(particles))

@@ -1,12 +1,12 @@
 """Which of three policies to deploy: real rollouts count for and against what simulation promises of them. Pure.
 
-The three are the prior as it is, which stays for good, the prior behind the correction that the posterior chooses, and
-what learns. Either the simulator is right about them, then a rollout succeeds as often as it promised, which counts as
-four rollouts, or it says nothing, then only what a policy did in real rollouts counts. Every rollout changes how
-probable the first is (Bayes' rule), by how well it was promised. So under a misfit promises fade to the policies' own
-records, and simulation can neither veto nor promote; and what learns is tried where the others fail, whatever
-simulation says. Where halves of the rollouts contradict each other, none of the simulator's systems is the real one,
-and only records count at once.
+The three are the prior as it is, which stays for good, the prior behind the correction that does best in simulation,
+and behind the one that fits real steps best. Either the simulator is right about them, then a rollout succeeds as often
+as it promised, which counts as four rollouts, or it says nothing, then only what a policy did in real rollouts counts.
+Every rollout changes how probable the first is (Bayes' rule), by how well it was promised. So under a misfit promises
+fade to the policies' own records, and simulation can neither veto nor promote; and the fit is tried where the others
+fail, whatever simulation says. Where halves of the rollouts contradict each other, none of the simulator's systems is
+the real one, and only records count at once.
 
 tests/sgft_jax/posterior/test_trust.py states the errors, for simulators of several biases.
 """
@@ -19,18 +19,17 @@ import jax.numpy as jnp
 
 from envs.types import Array
 
-AS_IS, CORRECTED, LEARNED = range(3)
-POLICIES = ("as_is", "corrected", "learned")  # in metrics
+AS_IS, CORRECTED, FITTED = range(3)
+POLICIES = ("as_is", "corrected", "fitted")  # in metrics
 
 _RIGHT, _MOST = 0.8, 0.9  # probability that a simulator is right, before any rollout and at most
 _SURE = 0.15  # no promise is surer than this of success or failure
 _WON, _LOST = 1.0, 0.5  # imagined rollouts of the prior as it is
 _DOUBT, _HALF = 1.5, 0.5  # imagined rollouts behind a correction of a wrong simulator, half as good as these
-_CREDIT = 1.0  # imagined rollouts of what learns, half way between the better of the two and success
+_CREDIT = 1.0  # imagined rollouts behind the fit, half way between the better of the two and success
 _TIMES = 1.2  # what replaces a policy must be so many times as good: one that works has more to lose
 _WORKS = 0.5  # a correction must promise so much: where none works in any system, none of them is the real one
 _PROMISE = 4.0  # rollouts that a promise counts as, beside those that a policy has played
-_FADE = 0.9  # what learns has changed: so many times its rollouts count
 
 
 class Trust(NamedTuple):
@@ -62,12 +61,6 @@ def told(trust: Trust, deployed: Array, promised: Array, success: Array) -> Trus
     return trust._replace(log_odds=trust.log_odds + gain, won=won, lost=lost)
 
 
-def faded(trust: Trust) -> Trust:
-    """After a learning phase."""
-    share = jnp.ones(3).at[LEARNED].set(_FADE)
-    return trust._replace(won=share * trust.won, lost=share * trust.lost)
-
-
 def expected(trust: Trust, promised: Array) -> Array:
     """[3] the success to expect of the policies. promised: [3] by the simulator, nan where it has not tried one."""
     right, records = jnp.minimum(jax.nn.sigmoid(trust.log_odds), _MOST), _records(trust)
@@ -81,7 +74,7 @@ def choice(trust: Trust, promised: Array) -> Array:
     known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised))
     helps = (known[CORRECTED] > _TIMES * known[AS_IS]) & (promised[CORRECTED] >= _WORKS)
     base = jnp.where(helps, CORRECTED, AS_IS)
-    which = jnp.where(known[LEARNED] > _TIMES * known[base], LEARNED, base)
+    which = jnp.where(known[FITTED] > _TIMES * known[base], FITTED, base)
     return which.astype(jnp.int32)
 
 
@@ -89,8 +82,8 @@ def _records(trust: Trust) -> Array:
     """[3] by real rollouts alone."""
     as_is = _mean(trust, _WON / (_WON + _LOST), _WON + _LOST)[AS_IS]
     corrected = _mean(trust, _HALF * as_is, _DOUBT)[CORRECTED]
-    learned = _mean(trust, (1.0 + jnp.maximum(as_is, corrected)) / 2.0, _CREDIT)[LEARNED]
-    return jnp.stack([as_is, corrected, learned])
+    fitted = _mean(trust, (1.0 + jnp.maximum(as_is, corrected)) / 2.0, _CREDIT)[FITTED]
+    return jnp.stack([as_is, corrected, fitted])
 
 
 def _mean(trust: Trust, usual: Array | float, weight: float) -> Array:

@@ -11,18 +11,21 @@ import untrained
 
 from envs import gaps
 from envs.rollout import real_worlds
+from sgft_jax.data import replay
 from sgft_jax.data.replay import blank
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io import priors
 from sgft_jax.io.priors import load_prior, load_priors, save_prior
 from sgft_jax.learners.sac import SACConfig
 from sgft_jax.methods import get_method
+from sgft_jax.models import distortion
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.posterior import estimator
 from sgft_jax.posterior.interface import entry_of
-from sgft_jax.posterior.trust import AS_IS, CORRECTED, LEARNED
+from sgft_jax.posterior.trust import AS_IS, CORRECTED, FITTED
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
+from sgft_jax.train.simulation import SimulatedRows
 from sgft_jax.types import Batch, Normalizer, Prior, SimulatedData, UserError
 
 TOY = toy.make()
@@ -62,21 +65,25 @@ def real(**effects):
 
 @pytest.mark.heavy
 def test_every_rollout_is_remembered_and_chooses_anew():
-    fine, seeds = build(learns=False), jnp.array([0, 1], jnp.uint32)
-    start = jax.tree.map(lambda x: x[None], prior().params)
-    states = list(finetuning.finetune(fine, real(action_scale=0.7), start, seeds, rollouts=2))
+    fine, seeds = build(), jnp.array([0, 1], jnp.uint32)
+    start, system = jax.tree.map(lambda x: x[None], prior().params), real(action_scale=0.7)
+    episode = replay.add_episode(replay.init(blank(4, 2), 20), rows(jax.random.key(0), 20), jnp.ones(20, bool))
+    simulation = SimulatedRows(jax.tree.map(lambda x: x[None], episode), jnp.zeros((1, 1)))
+    states = list(finetuning.finetune(fine, system, start, seeds, rollouts=2, simulated=lambda: simulation))
     progress, metrics = states[-1]
-    known, which = progress.agent.agent.interface, progress.agent.which
-    assert (
-        known.count.tolist() == [2, 2] and known.rollouts.valid[:, :2].all() and not known.rollouts.valid[:, 2:].any()
-    )
-    for name in ("as_is", "corrected"):
+    known = progress.agent.agent.interface
+    assert known.count.tolist() == [2, 2]
+    assert known.rollouts.valid[:, :2].all() and not known.rollouts.valid[:, 2:].any()
+    for name in ("as_is", "corrected", "fitted"):
         assert ((metrics[f"posterior/{name}"] >= 0) & (metrics[f"posterior/{name}"] <= 1)).all()
-    assert jnp.isnan(known.promised[:, LEARNED]).all() and (which != LEARNED).all()
-    assert not known.distortion.bias[which == AS_IS].any(), "the prior as it is corrects nothing"
-    exported = jax.vmap(fine.export)(progress.agent)
-    assert exported.estimator is None and jax.tree.map(jnp.array_equal, exported.distortion, known.distortion)
-    np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"][0], prior().params.actor["Dense_0"]["kernel"])
+    for which, undo in ((CORRECTED, known.distortion), (FITTED, known.fit.distortion)):
+        exported = jax.vmap(lambda state, which=which: fine.export(state._replace(which=jnp.int32(which))))(
+            progress.agent
+        )
+        assert exported.estimator is None and jax.tree.map(jnp.array_equal, exported.distortion, undo)
+        np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"][0], prior().params.actor["Dense_0"]["kernel"])
+    exported = jax.vmap(lambda state: fine.export(state._replace(which=jnp.int32(AS_IS))))(progress.agent)
+    assert not exported.distortion.bias.any(), "the prior as it is corrects nothing"
 
 
 def rows(key, n):
@@ -87,25 +94,27 @@ def rows(key, n):
     )
 
 
+def simulated():
+    return SimulatedData(lambda key, n: Batch(*rows(key, n)), jnp.zeros(1))
+
+
 @pytest.mark.heavy
-def test_what_learned_is_deployed_where_the_others_fail():
-    """And acts behind the correction, as it learned."""
-    fine, key = build(learns=True, utd=1.0, batch_size=8, actor_ramp=0, critic_warmup=0, lr_warmup=0), jax.random.key(0)
-    data = SimulatedData(lambda key, n: Batch(*rows(key, n)), jnp.zeros(1))
-    state = fine.prepare(fine.init(prior().params, key), data)
-    first, begun = fine.export(state), state
-    state = jax.jit(fine.observe)(state, rows(key, 20), jnp.ones(20, bool), jnp.float32(0))
-    lost = state._replace(trust=state.trust._replace(lost=jnp.array([9.0, 9.0, 0.0]), log_odds=jnp.float32(-9)))
-    after, metrics = jax.jit(lambda state: fine.learn(state, key, 20, data))(lost)
-    kinds = [[jax.typeof(x) for x in jax.tree.leaves(y)] for y in (begun, after)]
+@pytest.mark.parametrize("fits", [True, False])
+def test_what_fits_real_steps_is_deployed_where_the_others_fail(fits, monkeypatch):
+    """And there is no fit where no correction explains them better than none."""
+    monkeypatch.setattr(distortion, "_EVIDENCE", -1e6 if fits else 1e6)
+    fine, key = build(), jax.random.key(0)
+    state = fine.prepare(fine.init(prior().params, key), simulated())
+    begun, state = state, jax.jit(fine.observe)(state, rows(key, 20), jnp.ones(20, bool), jnp.float32(0))
+    kinds = [[jax.typeof(x) for x in jax.tree.leaves(y)] for y in (begun, state)]
     assert kinds[0] == kinds[1], "another rollout would compile everything again"
-    assert metrics["posterior/deployed"] == LEARNED and 0 <= metrics["posterior/learned"] <= 1
-    exported, changed = fine.export(after), after.agent.learner.actor.params["Dense_0"]["kernel"]
-    np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"], changed)
-    assert not jnp.array_equal(changed, first.actor["Dense_0"]["kernel"])
-    for which in (AS_IS, CORRECTED):
-        exported = fine.export(after._replace(which=jnp.int32(which)))
-        np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"], first.actor["Dense_0"]["kernel"])
+    known = state.agent.interface
+    assert jnp.isnan(known.promised[FITTED]) != fits
+    lost = state._replace(trust=state.trust._replace(lost=jnp.array([9.0, 9.0, 0.0]), log_odds=jnp.float32(-9)))
+    after = jax.jit(fine.observe)(lost, rows(key, 20), jnp.ones(20, bool), jnp.float32(0))
+    assert (after.which == FITTED) == fits
+    metrics = fine.learn(after, key, 1, simulated())[1]
+    assert metrics["posterior/deployed"] == after.which and metrics["posterior/contradicted"] in (0, 1)
 
 
 def test_a_log_without_success_chooses_nothing():

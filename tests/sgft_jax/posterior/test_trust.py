@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import pytest
 
 from sgft_jax.posterior import trust
-from sgft_jax.posterior.trust import AS_IS, CORRECTED, LEARNED
+from sgft_jax.posterior.trust import AS_IS, CORRECTED, FITTED
 
 RUNS, ROLLOUTS = 10_000, 20
 NOTHING = jnp.full(3, jnp.nan)
 
 
-@functools.partial(jax.jit, static_argnames="learns")
-def fates(bias, std, *, learns):
+@functools.partial(jax.jit, static_argnames="fits")
+def fates(bias, std, *, fits):
     """Success [runs, 3] of the policies, and [runs, rollouts] of what is deployed.
 
     Success rates are uniform. bias: [3] of the simulator's promises for them. std: of further errors, which stay the
@@ -30,9 +30,9 @@ def fates(bias, std, *, learns):
             known, which, promised = carry
             key_promise, key_play = jax.random.split(key)
             success = jax.random.bernoulli(key_play, true[which])
-            known = trust.faded(trust.told(known, which, promised, success))
+            known = trust.told(known, which, promised, success)
             promised = jnp.clip(true + wrong + 0.03 * jax.random.normal(key_promise, (3,)), 0.0, 1.0)
-            promised = promised if learns else promised.at[LEARNED].set(jnp.nan)
+            promised = promised if fits else promised.at[FITTED].set(jnp.nan)
             which = trust.choice(known, promised)
             return (known, which, promised), true[which]
 
@@ -42,7 +42,7 @@ def fates(bias, std, *, learns):
     return jax.vmap(run)(jax.random.split(jax.random.key(0), RUNS))
 
 
-# what learns is tried; bias for the prior as it is, behind a correction, and for what learns, std; then at most: runs
+# a fit is tried; bias for the prior as it is, behind a correction, and behind a fit, std; then at most: runs
 # that are 20 points below the prior at the end, at any time; at least: share of the possible gain, over all rollouts
 CASES = [
     (False, (0.0, 0.0, 0.0), 0.0, 0.0005, 0.001, 0.78),
@@ -64,10 +64,10 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("learns", "bias", "std", "end", "ever", "gain"), CASES)
-def test_falls_are_rare_and_gains_are_kept(learns, bias, std, end, ever, gain):
-    true, played = fates(jnp.array(bias), std, learns=learns)
-    prior, best = true[:, AS_IS], true[:, : 2 + learns].max(axis=1)
+@pytest.mark.parametrize(("fits", "bias", "std", "end", "ever", "gain"), CASES)
+def test_falls_are_rare_and_gains_are_kept(fits, bias, std, end, ever, gain):
+    true, played = fates(jnp.array(bias), std, fits=fits)
+    prior, best = true[:, AS_IS], true[:, : 2 + fits].max(axis=1)
     fell = prior[:, None] - played > 0.2
     assert fell[:, -1].mean() <= end and fell.any(axis=1).mean() <= ever
     assert (played.mean(axis=1) - prior).mean() / (best - prior).mean() >= gain
@@ -111,15 +111,15 @@ def test_without_a_promise_only_the_record_changes():
     assert known.won.tolist() == [1, 0, 0] and known.lost.tolist() == [0, 0, 0]
 
 
-@pytest.mark.parametrize("learned", [0.8, jnp.nan])
-def test_equal_promises_leave_the_prior(learned):
-    assert trust.choice(trust.begin(), jnp.array([0.8, 0.8, learned])) == AS_IS
+@pytest.mark.parametrize("fitted", [0.8, jnp.nan])
+def test_equal_promises_leave_the_prior(fitted):
+    assert trust.choice(trust.begin(), jnp.array([0.8, 0.8, fitted])) == AS_IS
 
 
-def test_what_learns_is_tried_where_the_others_fail_as_promised():
+def test_a_fit_is_tried_where_the_others_fail_as_promised():
     """No system of the simulator does what the real one does, and in none of them works what works there."""
     promised = jnp.array([0.05, 0.05, 0.03])
-    assert trust.choice(after((AS_IS, False), (AS_IS, False), promised=promised), promised) == LEARNED
+    assert trust.choice(after((AS_IS, False), (AS_IS, False), promised=promised), promised) == FITTED
 
 
 def test_where_no_correction_works_in_simulation_none_is_deployed():
@@ -127,7 +127,7 @@ def test_where_no_correction_works_in_simulation_none_is_deployed():
     assert trust.choice(after((AS_IS, False)), jnp.array([0.05, 0.45, jnp.nan])) == AS_IS
 
 
-def test_simulation_vetoes_what_learns_while_its_promises_are_kept():
+def test_simulation_vetoes_a_fit_while_its_promises_are_kept():
     promised = jnp.array([0.3, 0.9, 0.4])
     known = after((AS_IS, False), (CORRECTED, True), (CORRECTED, False), (CORRECTED, True), promised=promised)
     assert trust.choice(known, promised) == CORRECTED
@@ -138,9 +138,3 @@ def test_rollouts_that_no_system_makes_leave_records_alone():
     known = after((AS_IS, True), promised=promised)
     assert trust.choice(known, promised) == CORRECTED
     assert trust.choice(known._replace(contradicted=jnp.array(True)), promised) == AS_IS
-
-
-def test_old_rollouts_of_what_learns_count_less():
-    known = after((LEARNED, True), (AS_IS, True))
-    aged = trust.faded(known)
-    assert aged.won[LEARNED] < known.won[LEARNED] and aged.won[AS_IS] == known.won[AS_IS]
