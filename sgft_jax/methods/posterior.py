@@ -17,7 +17,10 @@ _MAKE = "`python -m experiments.estimate --prior PRIOR` makes it"
 
 @dataclass(frozen=True)
 class Config(checks.Checked):
-    """Options of `posterior`: none."""
+    """Options of `posterior`."""
+
+    initial_rollouts: checks.Count = 1
+    """Real rollouts of the prior as it is, whatever they say."""
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
@@ -39,14 +42,14 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
         raise UserError(f"method posterior: the prior has no estimator; {_MAKE}")
     if entry != entry_of(task):
         raise UserError(f"method posterior: the prior's estimator knows other systems than {task.name}; {_MAKE}")
-    del config
     network = network_of(card)
     policy, systems = sac_policy(task.obs_dim, task.act_dim, network), candidates(task)
     parts = unlearned(policy, lambda params, key: ((), params._replace(estimator=None)), lambda state: state.frozen)
     interface = posterior_interface(task, systems, policy, command_interface(network, task))
+    loop = LoopOptions(initial_rollouts=config.initial_rollouts)
     # Simulated rows tell how far the models are off.
     parts = parts._replace(interface=interface, simulation=Simulation(20_000, 0.6))
-    return deployed(assemble(parts, LoopOptions(), task)._replace(updates_per_rollout=1), policy)
+    return deployed(assemble(parts, loop, task)._replace(updates_per_rollout=1), policy)
 
 
 _ABOUT = "the prior behind a correction, tried in the systems that rollouts allow"
