@@ -22,6 +22,7 @@ from envs.types import Array, Key, PyTree, Transition
 _WIDTH, _HEADS, _STEPS, _ROLLOUTS = 128, 4, 3, 2  # of the encoder: units, heads, layers over steps and over rollouts
 _BINS, _HIDDEN = 256, 256  # of a histogram, and units of the network that fills it
 _WAVES = 6  # pairs of sine and cosine by which a number is read
+_DECILES = 10
 _SCALE = 4.0  # std of a measurement within which its waves tell places apart
 _HALF = 64  # points of the posterior of half of the rollouts
 _MANY = 4.0  # rollouts, for scale
@@ -54,13 +55,13 @@ class Statistics(NamedTuple):
 class Estimator(NamedTuple):
     """What a trained network needs: its params and the statistics of what it reads.
 
-    temper: [MOST, d] by how much the logits of each number are multiplied after 1, 2, ... rollouts. usual: [MOST] the
-    `contradiction` of so many that 95 % of the simulator's systems do not exceed. `learning.finish` fits both.
+    ranks: [MOST, d, deciles] log density of the true numbers' ranks in their histograms after 1, 2, ... rollouts. usual:
+    [MOST] the `contradiction` of so many that 95 % of the simulator's systems do not exceed. `learning.finish` fits both.
     """
 
     params: PyTree
     statistics: Statistics
-    temper: Array
+    ranks: Array
     usual: Array
 
 
@@ -149,7 +150,7 @@ def init(key: Key, rollouts: Rollout, d: int) -> Estimator:
     nothing = jnp.zeros(d)
     head = _Head().init(key_head, _Encoder().apply(encoder, *inputs), nothing, nothing)
     most = rollouts.success.shape[1]
-    return Estimator({"encoder": encoder, "head": head}, statistics, jnp.ones((most, d)), jnp.zeros(most))
+    return Estimator({"encoder": encoder, "head": head}, statistics, jnp.zeros((most, d, _DECILES)), jnp.zeros(most))
 
 
 def log_density(estimator: Estimator, rollouts: Rollout, counts: Array, point: Array) -> Array:
@@ -166,8 +167,22 @@ def histograms(estimator: Estimator, rollouts: Rollout, counts: Array, point: Ar
 
 def at(histograms: Array, point: Array) -> Array:
     """[d] what histograms [d, bins] hold at a point [d]."""
-    bins = jnp.clip(jnp.floor(point * _BINS).astype(jnp.int32), 0, _BINS - 1)
-    return histograms[jnp.arange(len(point)), bins]
+    return histograms[jnp.arange(len(point)), _bin(point)]
+
+
+def rank(histograms: Array, point: Array) -> Array:
+    """[d] the probability of less than each number of a point [d]."""
+    mass = jnp.exp(histograms) / _BINS
+    return at(jnp.cumsum(mass, axis=1) - mass, point) + at(mass, point) * (point * _BINS - _bin(point))
+
+
+def decile(rank: Array) -> Array:
+    """Into which of `ranks` a rank falls."""
+    return jnp.clip(jnp.floor(rank * _DECILES).astype(jnp.int32), 0, _DECILES - 1)
+
+
+def _bin(point: Array) -> Array:
+    return jnp.clip(jnp.floor(point * _BINS).astype(jnp.int32), 0, _BINS - 1)
 
 
 def draw(estimator: Estimator, rollouts: Rollout, counts: Array, d: int, key: Key, n: int) -> Array:
@@ -207,11 +222,14 @@ def contradiction(estimator: Estimator, rollouts: Rollout, counts: Array, d: int
 def _fill(estimator: Estimator, rollouts: Rollout, counts: Array) -> Callable[[Array, Array], Array]:
     """What fills histograms: (numbers so far [d], which one is next [d]) -> [bins] nats of its density."""
     context = _Encoder().apply(estimator.params["encoder"], *_read(estimator.statistics, rollouts, counts))
-    temper = estimator.temper[jnp.maximum(counts.sum(), 1) - 1]
+    ranks = estimator.ranks[jnp.maximum(counts.sum(), 1) - 1]
 
     def fill(before: Array, which: Array) -> Array:
-        logits = cast(Array, _Head().apply(estimator.params["head"], context, before, which))
-        return jax.nn.log_softmax(temper @ which * logits) + math.log(_BINS)
+        # Ranks that are too often in the middle, say, are those of a network that is not sure enough.
+        logits = jax.nn.log_softmax(cast(Array, _Head().apply(estimator.params["head"], context, before, which)))
+        mass = jnp.exp(logits)
+        right = logits + (which @ ranks)[decile(jnp.cumsum(mass) - mass / 2)]
+        return jax.nn.log_softmax(right) + math.log(_BINS)
 
     return fill
 

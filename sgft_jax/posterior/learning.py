@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from envs.base import Env
 from envs.types import Array, Key, Policy, PyTree
@@ -16,11 +15,12 @@ from sgft_jax.posterior.estimator import (
     MOST,
     Estimator,
     Rollout,
-    at,
     contradiction,
+    decile,
     histograms,
     init,
     log_density,
+    rank,
     rollout_of,
 )
 
@@ -32,7 +32,7 @@ _NEARLY, _WRONG = 0.12, 0.5  # std of what corrections miss, in units of the cub
 _EXPLORES = 0.5  # share of rollouts that explore, as training rollouts do
 
 _USUAL = 0.95  # share of systems whose rollouts contradict each other less than that
-_TEMPERS = np.geomspace(0.25, 4.0, 41)
+_EVEN = 10.0  # imagined true numbers in each decile
 
 _OPTIMISER = optim.adam(_GRADIENT)
 
@@ -112,29 +112,30 @@ def finish(estimator: Estimator, lessons: Lessons, key: Key) -> Estimator:
     """The same with what lessons tell that it has not learned from: how sure of each number it may be, and how much
     rollouts of one system contradict each other.
     """
-    tempered = estimator._replace(temper=_temper(estimator, lessons))
+    right = estimator._replace(ranks=_ranks(estimator, lessons))
 
     def contradicted(row: tuple[Rollout, Key]) -> Array:
         def after(n: Array) -> Array:
-            return contradiction(tempered, row[0], jnp.arange(MOST) < n, lessons.points.shape[1], row[1])
+            return contradiction(right, row[0], jnp.arange(MOST) < n, lessons.points.shape[1], row[1])
 
         return jax.lax.map(after, 1 + jnp.arange(MOST))
 
     keys = jax.random.split(key, len(lessons.points))
     nats = jax.lax.map(contradicted, (lessons.rollouts, keys), batch_size=64)
-    return tempered._replace(usual=jnp.quantile(nats, _USUAL, axis=0))
+    return right._replace(usual=jnp.quantile(nats, _USUAL, axis=0))
 
 
-def _temper(estimator: Estimator, lessons: Lessons) -> Array:
-    """[MOST, d] what makes these systems most probable (temperature scaling, Guo et al. 2017)."""
-    tempers = jnp.asarray(_TEMPERS, jnp.float32)
+def _ranks(estimator: Estimator, lessons: Lessons) -> Array:
+    """[MOST, d, deciles] log density of these systems' ranks, by which histograms are recalibrated (Kuleshov et al.
+    2018).
+    """
 
-    def nats(row: tuple[Array, Rollout]) -> Array:
+    def ranks(row: tuple[Array, Rollout]) -> Array:
         def after(n: Array) -> Array:
-            logits = histograms(estimator, row[1], jnp.arange(MOST) < n, row[0])
-            return jax.vmap(lambda temper: at(jax.nn.log_softmax(temper * logits), row[0]))(tempers)
+            return rank(histograms(estimator, row[1], jnp.arange(MOST) < n, row[0]), row[0])
 
         return jax.lax.map(after, 1 + jnp.arange(MOST))
 
-    best = jax.lax.map(nats, (lessons.points, lessons.rollouts), batch_size=64).sum(axis=0).argmax(axis=1)
-    return estimator.temper * tempers[best]
+    deciles = decile(jax.lax.map(ranks, (lessons.points, lessons.rollouts), batch_size=64))
+    share = _EVEN + jax.nn.one_hot(deciles, estimator.ranks.shape[-1]).sum(axis=0)
+    return jnp.log(share / share.mean(axis=-1, keepdims=True))
