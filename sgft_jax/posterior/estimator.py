@@ -22,7 +22,7 @@ from envs.types import Array, Key, PyTree, Transition
 _WIDTH, _HEADS, _STEPS, _ROLLOUTS = 128, 4, 3, 2  # of the encoder: units, heads, layers over steps and over rollouts
 _BINS, _HIDDEN = 256, 256  # of a histogram, and units of the network that fills it
 _WAVES = 6  # pairs of sine and cosine by which a number is read
-_DECILES = 10
+_RANKS = 20  # intervals of ranks, whose density is fitted
 _SCALE = 4.0  # std of a measurement within which its waves tell places apart
 _HALF = 64  # points of the posterior of half of the rollouts
 _MANY = 4.0  # rollouts, for scale
@@ -55,8 +55,8 @@ class Statistics(NamedTuple):
 class Estimator(NamedTuple):
     """What a trained network needs: its params and the statistics of what it reads.
 
-    ranks: [MOST, d, deciles] log density of the true numbers' ranks in their histograms after 1, 2, ... rollouts. usual:
-    [MOST] the `contradiction` of so many that 95 % of the simulator's systems do not exceed. `learning.finish` fits both.
+    ranks: [MOST, d, intervals] log density of the true numbers' ranks in their histograms, after 1, 2, ... rollouts.
+    usual: [MOST] the `contradiction` that 95 % of the simulator's systems do not exceed. `learning.finish` fits both.
     """
 
     params: PyTree
@@ -150,7 +150,7 @@ def init(key: Key, rollouts: Rollout, d: int) -> Estimator:
     nothing = jnp.zeros(d)
     head = _Head().init(key_head, _Encoder().apply(encoder, *inputs), nothing, nothing)
     most = rollouts.success.shape[1]
-    return Estimator({"encoder": encoder, "head": head}, statistics, jnp.zeros((most, d, _DECILES)), jnp.zeros(most))
+    return Estimator({"encoder": encoder, "head": head}, statistics, jnp.zeros((most, d, _RANKS)), jnp.zeros(most))
 
 
 def log_density(estimator: Estimator, rollouts: Rollout, counts: Array, point: Array) -> Array:
@@ -176,9 +176,9 @@ def rank(histograms: Array, point: Array) -> Array:
     return at(jnp.cumsum(mass, axis=1) - mass, point) + at(mass, point) * (point * _BINS - _bin(point))
 
 
-def decile(rank: Array) -> Array:
+def interval(rank: Array) -> Array:
     """Into which of `ranks` a rank falls."""
-    return jnp.clip(jnp.floor(rank * _DECILES).astype(jnp.int32), 0, _DECILES - 1)
+    return jnp.clip(jnp.floor(rank * _RANKS).astype(jnp.int32), 0, _RANKS - 1)
 
 
 def _bin(point: Array) -> Array:
@@ -228,7 +228,7 @@ def _fill(estimator: Estimator, rollouts: Rollout, counts: Array) -> Callable[[A
         # Ranks that are too often in the middle, say, are those of a network that is not sure enough.
         logits = jax.nn.log_softmax(cast(Array, _Head().apply(estimator.params["head"], context, before, which)))
         mass = jnp.exp(logits)
-        right = logits + (which @ ranks)[decile(jnp.cumsum(mass) - mass / 2)]
+        right = logits + (which @ ranks)[interval(jnp.cumsum(mass) - mass / 2)]
         return jax.nn.log_softmax(right) + math.log(_BINS)
 
     return fill

@@ -16,9 +16,9 @@ from sgft_jax.posterior.estimator import (
     Estimator,
     Rollout,
     contradiction,
-    decile,
     histograms,
     init,
+    interval,
     log_density,
     rank,
     rollout_of,
@@ -32,7 +32,7 @@ _NEARLY, _WRONG = 0.12, 0.5  # std of what corrections miss, in units of the cub
 _EXPLORES = 0.5  # share of rollouts that explore, as training rollouts do
 
 _USUAL = 0.95  # share of systems whose rollouts contradict each other less than that
-_EVEN = 10.0  # imagined true numbers in each decile
+_EVEN = 10.0  # imagined true numbers in each interval
 
 _OPTIMISER = optim.adam(_GRADIENT)
 
@@ -126,7 +126,7 @@ def finish(estimator: Estimator, lessons: Lessons, key: Key) -> Estimator:
 
 
 def _ranks(estimator: Estimator, lessons: Lessons) -> Array:
-    """[MOST, d, deciles] log density of these systems' ranks, by which histograms are recalibrated (Kuleshov et al.
+    """[MOST, d, intervals] log density of these systems' ranks, by which histograms are recalibrated (Kuleshov et al.
     2018).
     """
 
@@ -136,6 +136,6 @@ def _ranks(estimator: Estimator, lessons: Lessons) -> Array:
 
         return jax.lax.map(after, 1 + jnp.arange(MOST))
 
-    deciles = decile(jax.lax.map(ranks, (lessons.points, lessons.rollouts), batch_size=64))
-    share = _EVEN + jax.nn.one_hot(deciles, estimator.ranks.shape[-1]).sum(axis=0)
+    intervals = interval(jax.lax.map(ranks, (lessons.points, lessons.rollouts), batch_size=64))
+    share = _EVEN + jax.nn.one_hot(intervals, estimator.ranks.shape[-1]).sum(axis=0)
     return jnp.log(share / share.mean(axis=-1, keepdims=True))
