@@ -24,7 +24,19 @@ from envs.base import COMMANDS, WHOLE, Effects, Env, Numbers, Value, World
 from envs.files import parse_json, read_json, read_toml
 from envs.types import Array, Key, UserError, unknown
 
-__all__ = ["Gap", "by_scene", "changes", "drifts", "each", "find", "from_dict", "load", "presets", "read_file", "title"]
+__all__ = [
+    "Gap",
+    "by_scene",
+    "changes",
+    "drifts",
+    "expand",
+    "find",
+    "from_dict",
+    "load",
+    "presets",
+    "read_file",
+    "title",
+]
 __all__ += ["to_toml", "usual", "worlds"]
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
@@ -116,7 +128,7 @@ def usual(task: str) -> str:
     return "default" if "default" in known else next(iter(known), SIM)
 
 
-def each(sources: Iterable[str]) -> tuple[str, ...]:
+def expand(sources: Iterable[str]) -> tuple[str, ...]:
     """Sources of one gap each, see `find`: a file that holds several becomes "file.toml:name" of every one of them."""
     single: list[str] = []
     for source in sources:

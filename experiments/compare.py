@@ -86,7 +86,7 @@ def _draw(args: CompareArgs) -> None:
 
 def cells(args: CompareArgs) -> list[Cell]:
     """The grid, methods innermost, so that every task and real system is compared early."""
-    args = replace(args, reals=gaps.each(args.reals))
+    args = replace(args, reals=gaps.expand(args.reals))
     grid.check(args)
     name = (args.reference or DEFAULT).partition(":")[0]
     if name not in (*NAMES, *args.methods) and not any(args.out.glob(f"finetune/*/*/{glob.escape(name)}*")):
@@ -223,7 +223,7 @@ HYBRID_RUNS = Kind(
 
 def _checked(args: HybridGridArgs) -> HybridGridArgs:
     """The arguments with every gap by name; raises UserError for what is wrong in them alone."""
-    args = replace(args, gaps=gaps.each(args.gaps or tuple(gaps.presets(extend.name_of(args.task), variants=False))))
+    args = replace(args, gaps=gaps.expand(args.gaps or tuple(gaps.presets(extend.name_of(args.task), variants=False))))
     options.at_least_one(args, "eval_every", "eval_episodes")
     options.not_negative(args, "previous_actions", "minutes", "beside")
     options.seed_list(args.seed, args.seeds)

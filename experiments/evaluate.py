@@ -89,7 +89,7 @@ def main(args: EvaluateArgs) -> None:
 
 def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     """Success with its 95 % Wilson interval, mean return and share of exploded episodes of every policy everywhere."""
-    args = replace(args, real=gaps.each(args.real))
+    args = replace(args, real=gaps.expand(args.real))
     folders, task = check(args)
     groups = by_scene(extend.name_of(task), args.real)
     results = [_evaluate(replace(args, real=reals), folders, task) for reals in groups]

@@ -11,7 +11,7 @@ from experiments.runner import cli, options
 from sgft_jax.io.runs import check_folder
 
 if TYPE_CHECKING:
-    from sgft_jax.analysis.curves import Curve, Found
+    from sgft_jax.analysis.curves import Curve, Records
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def _nothing(args: FiguresArgs, notes: list[str]) -> str:
     return f"{message}; make one with: {made}"
 
 
-def select(records: "Found", *, variants: bool = True, **wanted: Sequence[str]) -> "Found":
+def select(records: "Records", *, variants: bool = True, **wanted: Sequence[str]) -> "Records":
     """Only the curves of certain tasks, gaps, methods or priors: names by field of `Curve`, empty for all.
 
     Raises UserError if no curve has one of the names, or if nothing is left.
@@ -93,7 +93,7 @@ def select(records: "Found", *, variants: bool = True, **wanted: Sequence[str]) 
     return records._replace(curves=curves)
 
 
-def write_results(records: "Found", target: Path, *, reference: str | None = None) -> Path:
+def write_results(records: "Records", target: Path, *, reference: str | None = None) -> Path:
     """A figure and tables for each task and gap, and of all tasks for each gap; returns the path of tables.md.
 
     reference: METHOD or METHOD:VARIANT that the others are compared with, see `tables.summary`; UserError without it.

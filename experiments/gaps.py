@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from envs import extend
-from envs.gaps import each, presets
+from envs.gaps import expand, presets
 from envs.types import UserError
 from experiments.runner import cli, options
 from experiments.runner.options import Impl, Task
@@ -76,7 +76,7 @@ def check(args: GapsArgs) -> tuple[GapsArgs, list[int], list[Path]]:
     """The arguments with every gap of a file, the seeds, and the folders of the priors; UserError for what is wrong."""
     cli.choose("--preset", args.preset, PRESETS)
     check_episodes(args)
-    args = replace(args, presets=each(args.presets))
+    args = replace(args, presets=expand(args.presets))
     options.without_repeats("--presets", args.presets)
     check_folder(args.out / "gaps")
     seeds, task = options.seed_list(args.seed, args.seeds), extend.name_of(args.task)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 from tyro.conf import arg
 
 from envs import extend
-from envs.gaps import SIM, each, title
+from envs.gaps import SIM, expand, title
 from envs.types import UserError
 from experiments.runner import cli, options
 from experiments.runner.options import FirstSeed, Impl, Out, Successors, Task
@@ -88,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def hybrid(args: HybridArgs) -> list[dict[str, Any]]:
     """Runs from (or back) to disk, one for each simulator; returns their summaries in the order of `gap`."""
-    args = replace(args, gap=each(args.gap))
+    args = replace(args, gap=expand(args.gap))
     method, seeds = check(args)
     for line in choices(args, method):
         print(line)

@@ -14,7 +14,7 @@ from sgft_jax.models import dynamics, networks, value
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
-from sgft_jax.models.system import told
+from sgft_jax.models.system import append_system
 from sgft_jax.types import Normalizer, Task
 
 __all__ = ["mpc_policy", "sac_policy", "tdmpc2_policy"]
@@ -33,7 +33,7 @@ def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
         if params.distortion is not None:
             obs = params.distortion.seen(obs)
         if params.system is not None:
-            obs = told(obs, params.system)
+            obs = append_system(obs, params.system)
         action = networks.tanh_gaussian_action(
             actor.apply(params.actor, normalize(params.normalizer, obs)), key, explore=explore
         )

@@ -98,7 +98,7 @@ class FinetuneArgs:
 
 def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     """Fine-tuning runs from (or back) to disk, one per real system; returns their summaries in the order of `real`."""
-    args = replace(args, real=gaps.each(args.real))
+    args = replace(args, real=gaps.expand(args.real))
     method, seeds = check(args)
     args = resolved(args)
     priors = priors_of(args)

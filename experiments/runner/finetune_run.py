@@ -340,7 +340,7 @@ class _Run(Training):
 
     def log(self, state: FinetuneProgress, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
         done = self.done(state)
-        for record, (metrics, transitions) in self.each((values, np.asarray(state.transitions))):
+        for record, (metrics, transitions) in self.by_record((values, np.asarray(state.transitions))):
             record.played = transitions
             record.metrics(done, metrics)
             with open(record.folder / "timing.jsonl", "a") as file:  # apart: metrics must not depend on the clock
@@ -360,7 +360,7 @@ class _Run(Training):
         played = finetuning.evaluate(self.finetuner, drifted(system, done), state.agent, self.seeds, self.episodes)
         self.played = {n: x for n, x in [*self.played.items(), (done, played)] if n in (0, done)}
         values = _scores(played, state.best.worst)
-        for record, (score, cost) in self.each((values, np.asarray(played.valid.sum((1, 2))))):
+        for record, (score, cost) in self.by_record((values, np.asarray(played.valid.sum((1, 2))))):
             record.evaluation(done, score, cost)
         return {f"{self.system.env.score}, evaluation": float(values["score"].mean())}
 

@@ -124,7 +124,7 @@ class _Run(Training):
         played = self._play(state, self.args.eval_episodes)
         measured = self.env.measures(played.transitions.next_obs, played.valid)  # what else the task is judged by
         values = scores(played) | {name: x.mean(-1) for name, x in measured.items()}
-        for record, part in self.each(values):
+        for record, part in self.by_record(values):
             record.log.eval(done, part)
         return {f"{self.env.score}, real system": float(values["score"].mean())}
 
@@ -140,7 +140,7 @@ class _Run(Training):
         params = jax.jit(jax.vmap(self.agent.export))(state.learner)
         filmed = functools.cache(lambda: self._play(state, 1))
         summaries = []
-        for i, (record, policies) in enumerate(self.each(params)):
+        for i, (record, policies) in enumerate(self.by_record(params)):
             gap, folder = self.gaps[i], record.folder
             record.log.close()
             record.save_policies("policy", policies, functools.partial(self._card, gap))

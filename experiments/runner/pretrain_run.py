@@ -135,7 +135,7 @@ class _Run(Training):
         super().__init__(f"pretrain {env.name}", self.config.chunks * size, len(record.seeds), **every)
         system = all_varying(env, gap.params, gap.effects) if gap else all_varying(env)
         self.fits = recipe_of(env, self.config).valued
-        self.card = pretraining.prior_card(env, self.config) | (pretraining.told(system) if self.fits else {})
+        self.card = pretraining.prior_card(env, self.config) | (pretraining.system_card(system) if self.fits else {})
         self.policy = make_policy(self.card, env)
         self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
         self.shapes = functools.cache(self._shapes)

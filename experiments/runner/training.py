@@ -89,7 +89,7 @@ class Training(abc.ABC):
         self.title, self.total, self.count, self.clock = title, total, count, Clock()
         self.eval_every, self.checkpoint_every = eval_every, checkpoint_every
 
-    def each(self, members: PyTree) -> Iterator[tuple[Any, PyTree]]:
+    def by_record(self, members: PyTree) -> Iterator[tuple[Any, PyTree]]:
         """Every record and, [S], what belongs to it in a pytree over all members."""
         return ((record, part(members, i, self.count)) for i, record in enumerate(self.records))
 
@@ -149,7 +149,7 @@ class Training(abc.ABC):
     def log(self, state: Any, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
         """Writes the metrics [M] of a chunk; returns what the progress bar shows."""
         done = self.done(state)
-        for record, metrics in self.each(values):
+        for record, metrics in self.by_record(values):
             record.log.metrics(done, metrics)
             check_finite(metrics, done, unit=self.unit, last_good=record.last_good)
         return {}
@@ -174,7 +174,7 @@ class Training(abc.ABC):
 
     def checkpoint(self, state: Any, done: int) -> None:
         """Writes the checkpoints of all records."""
-        for record, states in self.each(state):
+        for record, states in self.by_record(state):
             record.checkpoint(states, done)
 
 

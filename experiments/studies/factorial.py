@@ -106,7 +106,7 @@ def reals_of(args: FactorialArgs, task: str) -> tuple[str, ...]:
     """The real systems of a task: those of every task and those that name it, one gap each."""
     pairs = [text.partition("=") for text in args.reals]
     named = [(of, real) if equals and of in args.tasks else (task, of + equals + real) for of, equals, real in pairs]
-    return gaps.each([real for of, real in named if of == task])
+    return gaps.expand([real for of, real in named if of == task])
 
 
 def factors(args: FactorialArgs) -> dict[str, tuple[str, str]]:

@@ -168,7 +168,7 @@ def _run_units(
     sets = _prior_sets(args, task, preset)
     needs = _part_names(f"{task}/prior-{preset}", len(sets))
     priors = sum(run.seeds for run in sets)
-    systems = gaps.each(tuple(map(str, reals)))
+    systems = gaps.expand(tuple(map(str, reals)))
     shares = [systems[i :: args.split] for i in range(min(args.split, len(systems)))]
     home = run_folder(sets[0]) if len(sets) == 1 else run_folder(sets[0]).parent
     whole = f"{task}/{method}" + (f"-{AGAIN}" if again else "")

@@ -240,7 +240,7 @@ class _Runs(NamedTuple):
 def _real(args: PosteriorArgs, setup: Setup, key: Key) -> _Real:
     """The gaps of a task that are asked for, by default the drawn ones of development."""
     sources = args.gaps or (f"envs/gaps/development/{setup.env.name}-drawn.toml",)
-    drawn = [gaps.load(setup.env, source) for source in gaps.each(sources)]
+    drawn = [gaps.load(setup.env, source) for source in gaps.expand(sources)]
     env = real_env(setup.env, drawn)
     with doing(f"compiling {len(drawn)} real systems of {setup.env.name}", 40):
         pool, unknowns = real_worlds(env, drawn, key), setup.systems.unknowns

@@ -88,7 +88,7 @@ class Outcome(NamedTuple):
 
 def tune(args: TuneArgs) -> None:
     """Works through the trials, then writes and prints the results; raises UserError in the end if some did not run."""
-    args = replace(args, reals=gaps.each(args.reals))
+    args = replace(args, reals=gaps.expand(args.reals))
     grid.check(args)
     at_least_one(args, "trials")
     pairs, started, failed = list(itertools.product(args.tasks, args.methods)), time.monotonic(), []

@@ -100,7 +100,7 @@ class Curve:
         return replace(self, seeds=self.seeds[chosen], prior=self.prior[chosen], scores=scores, training=training)
 
 
-class Found(NamedTuple):
+class Records(NamedTuple):
     """Curves, and a line for each run that was left out or is unfinished."""
 
     curves: list[Curve]

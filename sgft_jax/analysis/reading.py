@@ -13,7 +13,7 @@ from msgspec import Meta
 from envs import gaps
 from envs.files import Count
 from envs.types import UserError
-from sgft_jax.analysis.curves import SCORES, Curve, Found
+from sgft_jax.analysis.curves import SCORES, Curve, Records
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import CONFIG, NO_DATA, NO_SIMULATOR, read_config, read_own, read_starts
 from sgft_jax.train.schedule import Schedule, name_of
@@ -134,7 +134,7 @@ def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
     return means
 
 
-def read_runs(out: Path) -> Found:
+def read_runs(out: Path) -> Records:
     """Every run below <out>/finetune. Runs that differ in seeds alone are one curve of all their seeds.
 
     If seeds are in several of them, or evaluations differ, that with the most seeds counts, then with most rollouts.
@@ -151,7 +151,7 @@ def read_runs(out: Path) -> Found:
         if (wanted := curve.facts.get("rollouts", 0)) > curve.x[-1]:
             notes.append(f"{folder}: unfinished, {curve.x[-1]} of {wanted} rollouts")
     together = [_together(same) for same in runs.values()]
-    return Found([curve for curve, _ in together], [*notes, *(note for _, more in together for note in more)])
+    return Records([curve for curve, _ in together], [*notes, *(note for _, more in together for note in more)])
 
 
 def _together(same: list[tuple[Curve, Path]]) -> tuple[Curve, list[str]]:

@@ -20,7 +20,7 @@ from envs import extend
 from envs.files import Count, read_object
 from envs.types import UserError
 from sgft_jax.analysis import reading
-from sgft_jax.analysis.curves import IDENTITY, SCORES, Curve, Found
+from sgft_jax.analysis.curves import IDENTITY, SCORES, Curve, Records
 from sgft_jax.files.disk import finite, read_csv, table_file, whole, write_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import read_config
@@ -202,12 +202,12 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Row]]) -> Curve
     )
 
 
-def read(out: Path, data: Path | None) -> Found:
+def read(out: Path, data: Path | None) -> Records:
     """The curves of released tables in the folder `data` or, without one, of the fine-tuning runs below `out`."""
     return read_data(data) if data else reading.read_runs(out)
 
 
-def read_data(folder: Path) -> Found:
+def read_data(folder: Path) -> Records:
     """The curves of released tables, `curves-*.csv.gz` or `.csv`; raises UserError for none, or a damaged one."""
     names = sorted({path.name.partition(".csv")[0] for path in folder.glob("curves-*.csv*")})
     files = [table_file(folder, name) for name in names]
@@ -216,7 +216,7 @@ def read_data(folder: Path) -> Found:
         raise UserError(f"{folder}: holds no curves-*.csv; write some from runs with: {command}")
     table = [row for path in files for row in read_csv(path, needed=(*IDENTITY, *_AXES, SCORES[0]))]
     try:
-        return Found(from_rows(table), [])
+        return Records(from_rows(table), [])
     except ValueError as error:  # of int and float
         raise UserError(f"{folder}/curves-*.csv: {error}; put the tables back as they were") from error
 

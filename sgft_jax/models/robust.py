@@ -13,7 +13,7 @@ _GUESSES, _FOLLOWED = 128, 6  # starting points where the cost has several minim
 _DEGREES = 3.0  # of freedom of Student's t: no model is right about every step
 
 
-class Found(NamedTuple):
+class Estimate(NamedTuple):
     """point: [p] of highest posterior probability. evidence: [] nats by which it explains the rows better than 0."""
 
     point: Array
@@ -51,7 +51,7 @@ def most_probable(
     *,
     bound: float | Array = inf,
     guessed: Sequence[int] = (),
-) -> Found:
+) -> Estimate:
     """Maximum a posteriori fit by Gauss-Newton steps under a Student t likelihood, whose scale is fitted too.
 
     missed(point [p]) -> [n, k] residuals. starts: [s, p] starting points. belief: [p] std of the Gaussian prior around
@@ -102,4 +102,4 @@ def most_probable(
     for key in jax.random.split(jax.random.key(0), 2):
         scale = jnp.maximum(robust_std(missed(best), held), spread)
         best = guess(best, scale, key)
-    return Found(best, cost(jnp.zeros_like(best), scale) - cost(best, scale))
+    return Estimate(best, cost(jnp.zeros_like(best), scale) - cost(best, scale))

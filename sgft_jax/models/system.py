@@ -28,7 +28,7 @@ class Estimate(NamedTuple):
     std: Array
 
 
-def told(obs: Array, system: Array) -> Array:
+def append_system(obs: Array, system: Array) -> Array:
     """The observation [obs_dim] whose last k entries are replaced by the parameters `system` [k]."""
     return jnp.concatenate([obs[: obs.shape[0] - system.shape[0]], system])
 
@@ -42,7 +42,7 @@ def residuals(predict: Predict, rows: Transition, system: Array) -> Array:
     """[n, d] what the model leaves unexplained of real steps [n] in that system [k]."""
 
     def one(row: Transition) -> Array:
-        change = predict(told(row.obs, system), row.action)
+        change = predict(append_system(row.obs, system), row.action)
         return (row.next_obs - row.obs)[: change.shape[0]] - change
 
     return jax.vmap(one)(rows)

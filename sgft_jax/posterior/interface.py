@@ -16,7 +16,7 @@ from sgft_jax.models.distortion import Distortion, Identified, Interface, Seen, 
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
 from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, contradiction, draw, rollout_of
-from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, choice, expected, told
+from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, choice, expected, update
 from sgft_jax.stacking import member, stack
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
 
@@ -130,7 +130,7 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         agent = inner.observe(state.agent, rows, valid, score)
         if score is None:  # none of the policies has played
             return state._replace(agent=agent)
-        trust = told(state.trust, state.which, state.agent.interface.promised, score > 0.5)
+        trust = update(state.trust, state.which, state.agent.interface.promised, score > 0.5)
         trust = trust._replace(contradicted=agent.interface.contradicted)
         return Deployed(agent, state.first, trust, choice(trust, agent.interface.promised))
 

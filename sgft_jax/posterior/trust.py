@@ -48,7 +48,7 @@ def begin() -> Trust:
     return Trust(jnp.float32(math.log(_RIGHT / (1.0 - _RIGHT))), jnp.zeros(3), jnp.zeros(3), jnp.zeros((), bool))
 
 
-def told(trust: Trust, deployed: Array, promised: Array, success: Array) -> Trust:
+def update(trust: Trust, deployed: Array, promised: Array, success: Array) -> Trust:
     """After a rollout. deployed: [] which policy played it. promised: [3] success, nan where nothing was. success: []
     bool.
     """

@@ -157,14 +157,14 @@ def value_fit_of(
     return program, (pools, stack([p._replace(value=None) for p in params]), jax.random.split(key_fit, len(priors)))
 
 
-def told(system: tuple[Varying, ...]) -> dict[str, Any]:
+def system_card(system: tuple[Varying, ...]) -> dict[str, Any]:
     """What a card says of a V_sim that can be told this."""
     return {"value_system": [v._asdict() for v in system]}
 
 
 def with_values(env: Env, priors: Sequence[Prior], values: PyTree) -> list[Prior]:
     """These priors with other parameters of V_sim [M, ...], which knows the rewards of `env`."""
-    facts = {**told(all_varying(env)), "sparse": env.sparse}
+    facts = {**system_card(all_varying(env)), "sparse": env.sparse}
     return [
         Prior(prior.params._replace(value=member(values, i)), {**prior.card, **facts}) for i, prior in enumerate(priors)
     ]

@@ -78,8 +78,8 @@ def test_a_file_holds_one_gap_or_several_by_name(tmp_path):
     assert gaps.load(ENV, str(tmp_path / "alone.toml")) == one
     assert gaps.title("a/alone.toml") == "alone" and gaps.title("mild") == "mild"
     named = (f"{file}:one", f"{file}:the 2nd")
-    assert gaps.each(["mild", str(file)]) == ("mild", *named) and gaps.each(named) == named
-    assert gaps.each([str(tmp_path / "alone.toml")]) == (str(tmp_path / "alone.toml"),)
+    assert gaps.expand(["mild", str(file)]) == ("mild", *named) and gaps.expand(named) == named
+    assert gaps.expand([str(tmp_path / "alone.toml")]) == (str(tmp_path / "alone.toml"),)
     with pytest.raises(UserError, match=r"some.toml holds 2 gaps; name one of them, e.g. .*some.toml:one$"):
         gaps.load(ENV, str(file))
     with pytest.raises(UserError, match=r"gap in .*some.toml: there is no 'tow'. Choose from: one, the 2nd"):
@@ -197,5 +197,5 @@ GAPS = sorted((pathlib.Path(envs.__file__).parent / "gaps").rglob("*.toml"))
 @pytest.mark.parametrize("path", [path for path in GAPS if path.parent.name != "distributions"], ids=lambda p: p.stem)
 def test_every_gap_that_comes_with_the_code_can_be_loaded(path):
     env = envs.make(max((task for task in envs.TASKS if path.stem.startswith(task)), key=len), "c")
-    for source in gaps.each([str(path)]):
+    for source in gaps.expand([str(path)]):
         gaps.load(env, source)

@@ -14,7 +14,7 @@ from envs.types import Transition
 from sgft_jax.models import dynamics
 from sgft_jax.models.distortion import turned_and_scaled
 from sgft_jax.models.networks import make_dynamics
-from sgft_jax.models.system import told
+from sgft_jax.models.system import append_system
 from sgft_jax.train import guard
 from sgft_jax.types import Batch, SimulatedData
 
@@ -252,7 +252,9 @@ def steps(name, key, n, choose, *, real):
     elif name == "guarded":
         after = jax.vmap(lambda obs, action: changed(name, obs, TURN.meaning(action)))(obs, action)
     else:
-        after = jax.vmap(lambda obs, action: changed(name, told(obs, WIND), action))(obs, action).at[:, 1].set(0.0)
+        after = (
+            jax.vmap(lambda obs, action: changed(name, append_system(obs, WIND), action))(obs, action).at[:, 1].set(0.0)
+        )
     return Transition(obs, action, -jnp.linalg.norm(after, axis=1), jnp.full(n, 0.9), after)
 
 

@@ -129,7 +129,7 @@ def test_it_acts_as_if_the_system_were_told_and_so_does_what_it_exports(found, p
     fine, _, after, _ = found
     obs = jnp.concatenate([jnp.array([0.3, -0.8, 0.1, 0.0]), jnp.zeros(K)])
     policy = make_policy(prior.card, ENV)
-    wish, _ = policy.act(prior.params, (), system.told(obs, after.learner[1].mean), key, explore=False)
+    wish, _ = policy.act(prior.params, (), system.append_system(obs, after.learner[1].mean), key, explore=False)
     blind, _ = policy.act(prior.params, (), obs, key, explore=False)
     action, _ = fine.act(after, (), obs, key, explore=False)
     np.testing.assert_allclose(action, wish, atol=1e-6)

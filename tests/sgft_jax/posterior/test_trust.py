@@ -30,7 +30,7 @@ def fates(bias, std, *, fits):
             known, which, promised = carry
             key_promise, key_play = jax.random.split(key)
             success = jax.random.bernoulli(key_play, true[which])
-            known = trust.told(known, which, promised, success)
+            known = trust.update(known, which, promised, success)
             promised = jnp.clip(true + wrong + 0.03 * jax.random.normal(key_promise, (3,)), 0.0, 1.0)
             promised = promised if fits else promised.at[FITTED].set(jnp.nan)
             which = trust.choice(known, promised)
@@ -77,7 +77,7 @@ def after(*rollouts, promised=NOTHING):
     """(policy, success) of rollouts that were promised so much."""
     known = trust.begin()
     for which, success in rollouts:
-        known = trust.told(known, which, promised, success)
+        known = trust.update(known, which, promised, success)
     return known
 
 
@@ -86,12 +86,12 @@ def test_one_failure_brings_a_good_prior_back():
     promised = jnp.array([0.5, 0.95, jnp.nan])
     known = after((AS_IS, True))
     assert trust.choice(known, promised) == CORRECTED
-    assert trust.choice(trust.told(known, CORRECTED, promised, False), promised) == AS_IS
+    assert trust.choice(trust.update(known, CORRECTED, promised, False), promised) == AS_IS
 
 
 def test_a_promise_that_is_kept_is_trusted_more():
     known, promised = trust.begin(), jnp.array([0.1, 0.9, jnp.nan])
-    kept = trust.told(known, CORRECTED, promised, True)
+    kept = trust.update(known, CORRECTED, promised, True)
     assert kept.log_odds > known.log_odds
     assert trust.expected(kept, promised)[CORRECTED] > trust.expected(known, promised)[CORRECTED]
 
