@@ -283,13 +283,12 @@ def sac_finetuner(
     value_baseline: bool = False,
     source: Callable[[FinetuneState], Source] | None = None,
     simulation: Simulation | None = None,
-    interface: Interface | None = None,
 ) -> Finetuner:
     """Fine-tuning whose learner is SAC, in networks and with numbers that the options tell.
 
     transforms: of every batch. horizon_dim: entries of the context that tell steps to go (`shorten`), 0 = none.
     value_baseline: a kept critic under shaped rewards is read as Q(s, a) - V_sim(s), its exact meaning in simulation.
-    source: of batches, default real rows alone. interface: what identifies, default by the option `identify`.
+    source: of batches, default real rows alone.
     """
     card = rules.card_of(prior)
     network, fresh = network_of(card), options.fresh or prior is None
@@ -344,7 +343,7 @@ def sac_finetuner(
         transform=compose(*transforms),
         imagine=_imagine(learner, network, card["gamma"], task) if transforms else lambda state, key: None,
         models=models,
-        interface=command_interface(network, task) if identifies else interface,
+        interface=command_interface(network, task) if identifies else None,
         beginner=simulator_actor if fresh and prior is not None else None,
         simulation=simulation,
         card={"critic_network": config.critic_network and jsonable(config.critic_network)},

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from experiments import estimate, finetune
+from experiments.runner import estimating
 from sgft_jax.io.cards import SHIPPED
 from sgft_jax.io.priors import load_prior
 from sgft_jax.posterior import decision, interface
@@ -24,8 +25,9 @@ def test_a_prior_is_given_an_estimator_and_adapts(prior, tmp_path, monkeypatch, 
     for module in (decision, interface):
         for name, value in {"CANDIDATES": 2, "JUDGES": 2}.items():
             monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(estimating, "_AT_ONCE", 2)  # so that both engines make lessons
     before = load_prior(prior)
-    estimate.main(estimate.EstimateArgs(prior=prior, lessons=4, updates=1, impl="c"))
+    estimate.main(estimate.EstimateArgs(prior=prior, lessons=4, updates=1, impl="jax"))
     assert "after 10 rollouts it is" in capsys.readouterr().out
     after = load_prior(prior)
     same = jax.tree.map(np.array_equal, *(without_estimator(prior.params) for prior in (before, after)))
