@@ -180,6 +180,7 @@ def test_the_phases_of_every_command():
         "estimate": {"compiling the simulator and worlds of ..."},
         "estimating": {
             "simulating ... rollouts of ... to learn from",
+            "checking how sure of systems of ... it may be",
             "learning which systems of ... make which rollouts",
         },
         "evaluate": {"building ... worlds for each system", "playing ... episodes for each policy"},
