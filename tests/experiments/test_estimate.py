@@ -27,7 +27,8 @@ def test_a_prior_is_given_an_estimator_and_adapts(prior, tmp_path, monkeypatch, 
             monkeypatch.setattr(module, name, value)
     monkeypatch.setattr(estimating, "_AT_ONCE", 2)  # so that both engines make lessons
     before = load_prior(prior)
-    estimate.main(estimate.EstimateArgs(prior=prior, lessons=4, updates=1, impl="jax"))
+    with jax.numpy_rank_promotion("allow"):  # MJX broadcasts matrices against vectors
+        estimate.main(estimate.EstimateArgs(prior=prior, lessons=4, updates=1, impl="jax"))
     assert "after 10 rollouts it is" in capsys.readouterr().out
     after = load_prior(prior)
     same = jax.tree.map(np.array_equal, *(without_estimator(prior.params) for prior in (before, after)))
