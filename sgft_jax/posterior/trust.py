@@ -26,7 +26,7 @@ _RIGHT, _MOST = 0.8, 0.9  # probability that a simulator is right, before any ro
 _SURE = 0.15  # no promise is surer than this of success or failure
 _WON, _LOST = 1.0, 0.5  # imagined rollouts of the prior as it is
 _DOUBT, _HALF = 1.5, 0.5  # imagined rollouts behind a correction of a wrong simulator, half as good as these
-_CREDIT = 1.0  # imagined rollouts behind the fit, half way between the better of the two and success
+_FITS, _CREDIT = 0.4, 1.0  # success behind a fit on development gaps that no system explains, and its imagined rollouts
 _TIMES = 1.2  # what replaces a policy must be so many times as good: one that works has more to lose
 _WORKS = 0.5  # a correction must promise so much: where none works in any system, none of them is the real one
 _PROMISE = 4.0  # rollouts that a promise counts as, beside those that a policy has played
@@ -82,7 +82,7 @@ def _records(trust: Trust) -> Array:
     """[3] by real rollouts alone."""
     as_is = _mean(trust, _WON / (_WON + _LOST), _WON + _LOST)[AS_IS]
     corrected = _mean(trust, _HALF * as_is, _DOUBT)[CORRECTED]
-    fitted = _mean(trust, (1.0 + jnp.maximum(as_is, corrected)) / 2.0, _CREDIT)[FITTED]
+    fitted = _mean(trust, _FITS, _CREDIT)[FITTED]
     return jnp.stack([as_is, corrected, fitted])
 
 
