@@ -119,7 +119,7 @@ def test_equal_promises_leave_the_prior(fitted):
 def test_a_fit_is_tried_where_the_others_fail_as_promised():
     """No system of the simulator does what the real one does, and in none of them works what works there."""
     promised = jnp.array([0.05, 0.05, 0.03])
-    assert trust.choice(after((AS_IS, False), (AS_IS, False), promised=promised), promised) == FITTED
+    assert trust.choice(after(*[(AS_IS, False)] * 3, promised=promised), promised) == FITTED
 
 
 def test_where_no_correction_works_in_simulation_none_is_deployed():
