@@ -36,8 +36,10 @@ __all__ = [
     "presets",
     "read_file",
     "title",
+    "to_toml",
+    "usual",
+    "worlds",
 ]
-__all__ += ["to_toml", "usual", "worlds"]
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
 _TABLES = ("params", "effects", "commands", "drift")

@@ -57,11 +57,11 @@ def learned(
             for step in steps.values():
                 ahead.promise(step, lambda: (shape, whole, key_learn))
             for i in range(1, parts):
-                program = programs[i % _SECOND == 1 and len(programs) > 1]
+                program = programs[-1 if i % _SECOND == 1 else 0]
                 taught.append(program(params[i % len(params)], jax.random.fold_in(key_play, i)))
                 jax.block_until_ready(taught[max(0, i - _SECOND)])  # two engines work beside each other
                 far((i + 1) / parts)
-            seen = jax.tree.map(jnp.asarray, join(jax.device_get(taught)))
+            seen = join(jax.device_get(taught))  # from two devices
         count = -(-updates // per_call)
         with doing(f"learning which systems of {name} make which rollouts", 100):
             learning = start(key_start, seen)
@@ -94,7 +94,7 @@ def _others(simulators: Sequence[Simulator], policy: Policy, params: PyTree, key
     lessons = [
         _program(simulator, policy, few)(params, jax.random.fold_in(key, i)) for i, simulator in enumerate(simulators)
     ]
-    return jax.tree.map(jnp.asarray, join(jax.device_get(lessons)))
+    return join(jax.device_get(lessons))
 
 
 def _gained(estimator: Estimator, lessons: Lessons) -> dict[int, float]:

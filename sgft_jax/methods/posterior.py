@@ -20,7 +20,7 @@ class Config(checks.Checked):
     """Options of `posterior`."""
 
     initial_rollouts: checks.Count = 1
-    """Real rollouts before the first line of metrics and the first evaluation after one."""
+    """Real rollouts before the first metrics; from then on they follow every rollout."""
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:

@@ -130,9 +130,8 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         agent = inner.observe(state.agent, rows, valid, score)
         if score is None:  # none of the policies has played
             return state._replace(agent=agent)
-        trust = update(state.trust, state.which, state.agent.interface.promised, score > 0.5)
-        trust = trust._replace(contradicted=agent.interface.contradicted)
-        return Deployed(agent, state.first, trust, choice(trust, agent.interface.promised))
+        trust, known = update(state.trust, state.which, state.agent.interface.promised, score > 0.5), agent.interface
+        return Deployed(agent, state.first, trust, choice(trust, known.promised, known.contradicted))
 
     def learn(
         state: Deployed,
@@ -144,9 +143,10 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         limit: Array | None = None,
     ) -> tuple[Deployed, Metrics]:
         agent, metrics = inner.learn(state.agent, key, updates, simulated, offline=offline, limit=limit)
-        successes = expected(state.trust, agent.interface.promised)
+        known = agent.interface
+        successes = expected(state.trust, known.promised, known.contradicted)
         metrics |= {f"posterior/{name}": x for name, x in zip(POLICIES, successes, strict=True)}
-        facts = {"deployed": state.which, "contradicted": state.trust.contradicted}
+        facts = {"deployed": state.which, "contradicted": known.contradicted}
         metrics |= {f"posterior/{name}": x.astype(jnp.float32) for name, x in facts.items()}
         return state._replace(agent=agent), metrics
 

@@ -1,6 +1,7 @@
 """How the estimator learns: from rollouts of simulated systems that are known. Pure."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -112,17 +113,14 @@ def finish(estimator: Estimator, lessons: Lessons, key: Key) -> Estimator:
     """The same with what lessons tell that it has not learned from: how sure of each number it may be, and how much
     rollouts of one system contradict each other.
     """
+    n, d = lessons.points.shape
     right = estimator._replace(ranks=_ranks(estimator, lessons))
 
-    def contradicted(row: tuple[Rollout, Key]) -> Array:
-        def after(n: Array) -> Array:
-            return contradiction(right, row[0], jnp.arange(MOST) < n, lessons.points.shape[1], row[1])
+    def nats(row: tuple[Rollout, Key], counts: Array) -> Array:
+        return contradiction(right, row[0], counts, d, row[1])
 
-        return jax.lax.map(after, 1 + jnp.arange(MOST))
-
-    keys = jax.random.split(key, len(lessons.points))
-    nats = jax.lax.map(contradicted, (lessons.rollouts, keys), batch_size=64)
-    return right._replace(usual=jnp.quantile(nats, _USUAL, axis=0))
+    contradictions = _by_number(nats, (lessons.rollouts, jax.random.split(key, n)))
+    return right._replace(usual=jnp.quantile(contradictions, _USUAL, axis=0))
 
 
 def _ranks(estimator: Estimator, lessons: Lessons) -> Array:
@@ -130,12 +128,18 @@ def _ranks(estimator: Estimator, lessons: Lessons) -> Array:
     2018).
     """
 
-    def ranks(row: tuple[Array, Rollout]) -> Array:
-        def after(n: Array) -> Array:
-            return rank(histograms(estimator, row[1], jnp.arange(MOST) < n, row[0]), row[0])
+    def ranks(row: tuple[Array, Rollout], counts: Array) -> Array:
+        return rank(histograms(estimator, row[1], counts, row[0]), row[0])
 
-        return jax.lax.map(after, 1 + jnp.arange(MOST))
-
-    intervals = interval(jax.lax.map(ranks, (lessons.points, lessons.rollouts), batch_size=64))
+    intervals = interval(_by_number(ranks, (lessons.points, lessons.rollouts)))
     share = _EVEN + jax.nn.one_hot(intervals, estimator.ranks.shape[-1]).sum(axis=0)
     return jnp.log(share / share.mean(axis=-1, keepdims=True))
+
+
+def _by_number(value: Callable[[Any, Array], Array], rows: PyTree) -> Array:
+    """[n, MOST, ...] value(row, which rollouts count) of rows [n], after 1, 2, ... rollouts."""
+
+    def of_row(row: Any) -> Array:
+        return jax.lax.map(lambda number: value(row, jnp.arange(MOST) < number), 1 + jnp.arange(MOST))
+
+    return jax.lax.map(of_row, rows, batch_size=64)

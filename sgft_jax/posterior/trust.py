@@ -33,19 +33,16 @@ _PROMISE = 4.0  # rollouts that a promise counts as, beside those that a policy 
 
 
 class Trust(NamedTuple):
-    """log_odds: [] that the simulator is right. won, lost: [3] real rollouts of the policies. contradicted: [] bool,
-    whether no system of the simulator makes rollouts as they were.
-    """
+    """log_odds: [] that the simulator is right. won, lost: [3] real rollouts of the policies."""
 
     log_odds: Array
     won: Array
     lost: Array
-    contradicted: Array
 
 
 def begin() -> Trust:
     """Before any rollout."""
-    return Trust(jnp.float32(math.log(_RIGHT / (1.0 - _RIGHT))), jnp.zeros(3), jnp.zeros(3), jnp.zeros((), bool))
+    return Trust(jnp.float32(math.log(_RIGHT / (1.0 - _RIGHT))), jnp.zeros(3), jnp.zeros(3))
 
 
 def update(trust: Trust, deployed: Array, promised: Array, success: Array) -> Trust:
@@ -57,21 +54,22 @@ def update(trust: Trust, deployed: Array, promised: Array, success: Array) -> Tr
     sure = jnp.where(jnp.isnan(promise), usual, jnp.clip(promise, _SURE, 1.0 - _SURE))
     gain = jnp.where(success, jnp.log(sure / usual), jnp.log((1.0 - sure) / (1.0 - usual)))
     row = jax.nn.one_hot(deployed, 3)
-    won, lost = trust.won + row * success, trust.lost + row * ~success
-    return trust._replace(log_odds=trust.log_odds + gain, won=won, lost=lost)
+    return Trust(trust.log_odds + gain, trust.won + row * success, trust.lost + row * ~success)
 
 
-def expected(trust: Trust, promised: Array) -> Array:
-    """[3] the success to expect of the policies. promised: [3] by the simulator, nan where it has not tried one."""
+def expected(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
+    """[3] the success to expect of the policies. promised: [3] by the simulator, nan where it has not tried one.
+    contradicted: [] bool, whether no system of the simulator makes rollouts as they were.
+    """
     right, records = jnp.minimum(jax.nn.sigmoid(trust.log_odds), _MOST), _records(trust)
-    right = jnp.where(trust.contradicted, 0.0, right)
+    right = jnp.where(contradicted, 0.0, right)
     seen = _mean(trust, promised, _PROMISE)
     return jnp.where(jnp.isnan(promised), records, right * seen + (1.0 - right) * records)
 
 
-def choice(trust: Trust, promised: Array) -> Array:
-    """[] which policy to deploy. promised: [3] as of `expected`; nan for one that there is not."""
-    known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised))
+def choice(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
+    """[] which policy to deploy. Arguments as of `expected`; promised is nan for a policy that there is not."""
+    known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised, contradicted))
     helps = (known[CORRECTED] > _TIMES * known[AS_IS]) & (promised[CORRECTED] >= _WORKS)
     base = jnp.where(helps, CORRECTED, AS_IS)
     which = jnp.where(known[FITTED] > _TIMES * known[base], FITTED, base)
