@@ -57,7 +57,7 @@ def main(args: DemoArgs) -> None:
     print("\nWhich system is it? 80 % intervals of what rollouts tell most of:\n")
     print(tables.markdown(["", *after, "true"], rows))
     print("\nSuccess without exploration, before it promised by simulation:\n")
-    print(tables.markdown(["rollouts", "deployed", "promised", "succeeds"], outcome(home)))
+    print(tables.markdown(["rollouts", "deployed", "promised", "succeeds", "plays the next rollout"], outcome(home)))
     print(f"\nfigure: {path}\nother kinds of gap: docs/results.md")
     print(f"{(time.monotonic() - started) / 60:.1f} minutes in all")
 
@@ -77,15 +77,18 @@ def plan(args: DemoArgs) -> FinetuneArgs:
 
 
 def outcome(home: Path) -> list[list[str]]:
-    """After each number of rollouts what is deployed, the success that is promised for it, and its success."""
+    """After each number of rollouts what is deployed, the success that is promised for it, its success, and what plays
+    the next rollout.
+    """
     from sgft_jax.posterior.trust import POLICIES
 
     scores = {int(record["rollouts"]): record["score"][0] for record in read_jsonl(home / EVAL)}
-    lines = [["0", "the prior as it is", "", f"{100 * scores[0]:.0f} %"]]
+    words = [f"the prior {policy.replace('_', ' ')}" for policy in POLICIES]
+    lines = [["0", words[0], "", f"{100 * scores[0]:.0f} %", words[0]]]
     for record in read_jsonl(home / METRICS):
-        policy, n = POLICIES[int(record["posterior/deployed"][0])], int(record["rollouts"])
-        promised = f"{100 * record[f'posterior/{policy}'][0]:.0f} %"
-        lines.append([str(n), f"the prior {policy.replace('_', ' ')}", promised, f"{100 * scores[n]:.0f} %"])
+        kept, tried = (int(record[f"posterior/{name}"][0]) for name in ("deployed", "tried"))
+        promised, score = record[f"posterior/{POLICIES[kept]}"][0], scores[n := int(record["rollouts"])]
+        lines.append([str(n), words[kept], f"{100 * promised:.0f} %", f"{100 * score:.0f} %", words[tried]])
     return lines
 
 

@@ -246,14 +246,15 @@ class Finetuner(NamedTuple):
     observe(state, transitions [T, ...], valid [T], score []) -> state: keeps the rows of one episode, in order. score:
         of the episode, -inf if its physics exploded; None if another policy has played it, as in a log, so that a guard
         does not count it.
-    export(state) -> params of the agent as it acts now.
+    export(state) -> params of the agent as it would be deployed now.
     policy: how exported params act.
     updates_per_rollout: gradient updates that follow a real rollout of full length.
     initial_rollouts: real rollouts before the first update.
     initial_policy: what makes them, from the prior's params; None = the agent itself.
     simulation: the simulated data that the method needs, or None.
     card: what the card of an exported policy says beyond the prior's, such as the options of a plan.
-    guarded: whether a guard chooses who acts: that is `policy` with what `export` returns.
+    trial(state) -> params by which it acts in its next rollout; None = those of `export`.
+    guarded: whether a guard chooses who acts.
     estimates: whether it reads the estimator of a prior.
     """
 
@@ -270,6 +271,7 @@ class Finetuner(NamedTuple):
     initial_policy: Policy | None
     simulation: Simulation | None
     card: Mapping[str, Any]
+    trial: Callable[[PyTree], PyTree] | None = None
     guarded: bool = False
     estimates: bool = False
 

@@ -19,7 +19,7 @@ from sgft_jax.stacking import join
 
 _SEED = 1_000_000
 _AT_ONCE = 3072  # systems that are simulated in one program, each with `MOST` rollouts
-_SECOND = 4  # one in so many programs runs in the second engine
+_SECOND = 8  # one in so many programs runs in the second engine
 _TURNS = 50  # into how many calls the updates are divided
 _FRESH, _TEST = 1024, 256  # systems that it has not learned from: to finish it, and to judge it
 

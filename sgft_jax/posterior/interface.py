@@ -16,7 +16,7 @@ from sgft_jax.models.distortion import Distortion, Identified, Interface, Seen, 
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
 from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, contradiction, draw, rollout_of
-from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, choice, expected, update
+from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, choice, expected, proven, update
 from sgft_jax.stacking import member, stack
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
 
@@ -43,14 +43,15 @@ class Believed(NamedTuple):
 
 
 class Deployed(NamedTuple):
-    """agent: the state of what adapts. first: params of the simulator's policy. which: [] the policy of `trust` that
-    is deployed.
+    """agent: the state of what adapts. first: params of the simulator's policy. tried: [] the policy of `trust` that
+    plays the next rollout, and `kept` [] the one that is deployed.
     """
 
     agent: PyTree
     first: PyTree
     trust: Trust
-    which: Array
+    tried: Array
+    kept: Array
 
 
 def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: Interface) -> Interface:
@@ -105,33 +106,40 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
     """The same fine-tuning, of which only that is deployed which simulation and real rollouts say is best.
 
     inner: identifies by `posterior_interface`; its exported params act by `policy`. `learn` must follow each rollout
-    once, as in `finetuning.finetune`. Metrics: posterior/deployed, the number of the policy of `trust`, the success
-    that is expected of each, and posterior/contradicted, 1 where no system of the simulator is the real one.
+    once, as in `finetuning.finetune`. Metrics: posterior/deployed and posterior/tried, numbers of policies of `trust`,
+    the success that is expected of each, and posterior/contradicted, 1 where no system of the simulator is the real one.
     """
 
     def init(params: PyTree, key: Key) -> Deployed:
         agent = inner.init(params, key)
         # A copy: the caller may donate the state, and the prior must survive that.
-        return Deployed(agent, jax.tree.map(jnp.copy, inner.export(agent)), begin(), jnp.int32(AS_IS))
+        return Deployed(agent, jax.tree.map(jnp.copy, inner.export(agent)), begin(), *[jnp.int32(AS_IS)] * 2)
 
     def prepare(state: Deployed, simulated: SimulatedData | None) -> Deployed:
         return state._replace(agent=inner.prepare(state.agent, simulated))
 
-    def export(state: Deployed) -> PyTree:
+    def params(state: Deployed, which: Array) -> PyTree:
         known = state.agent.interface
         behind = [state.first._replace(distortion=undo) for undo in (known.distortion, known.fit.distortion)]
-        return member(stack([state.first, *behind]), state.which)
+        return member(stack([state.first, *behind]), which)
+
+    def export(state: Deployed) -> PyTree:
+        return params(state, state.kept)
+
+    def trial(state: Deployed) -> PyTree:
+        return params(state, state.tried)
 
     def act(state: Deployed, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         del explore  # nothing learns from it, and what is promised does not
-        return policy.act(export(state), carry, obs, key, explore=False)
+        return policy.act(trial(state), carry, obs, key, explore=False)
 
     def observe(state: Deployed, rows: Transition, valid: Array, score: Array | None) -> Deployed:
         agent = inner.observe(state.agent, rows, valid, score)
         if score is None:  # none of the policies has played
             return state._replace(agent=agent)
-        trust, known = update(state.trust, state.which, state.agent.interface.promised, score > 0.5), agent.interface
-        return Deployed(agent, state.first, trust, choice(trust, known.promised, known.contradicted))
+        trust, known = update(state.trust, state.tried, state.agent.interface.promised, score > 0.5), agent.interface
+        tried, kept = (rule(trust, known.promised, known.contradicted) for rule in (choice, proven))
+        return Deployed(agent, state.first, trust, tried, kept)
 
     def learn(
         state: Deployed,
@@ -146,12 +154,12 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         known = agent.interface
         successes = expected(state.trust, known.promised, known.contradicted)
         metrics |= {f"posterior/{name}": x for name, x in zip(POLICIES, successes, strict=True)}
-        facts = {"deployed": state.which, "contradicted": known.contradicted}
+        facts = {"deployed": state.kept, "tried": state.tried, "contradicted": known.contradicted}
         metrics |= {f"posterior/{name}": x.astype(jnp.float32) for name, x in facts.items()}
         return state._replace(agent=agent), metrics
 
     changed = {"init": init, "prepare": prepare, "act": act, "observe": observe, "learn": learn, "export": export}
-    return inner._replace(init_carry=policy.init_carry, guarded=True, estimates=True, **changed)
+    return inner._replace(init_carry=policy.init_carry, trial=trial, guarded=True, estimates=True, **changed)
 
 
 def entry_of(env: Env) -> dict[str, Any]:

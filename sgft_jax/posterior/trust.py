@@ -1,4 +1,6 @@
-"""Which of three policies to deploy: real rollouts count for and against what simulation promises of them. Pure.
+"""Which of three policies to try, and which to deploy: real rollouts count for and against what simulation promises.
+
+Pure.
 
 The three are the prior as it is, which stays for good, the prior behind the correction that does best in simulation,
 and behind the one that fits real steps best. Either the simulator is right about them, then a rollout succeeds as often
@@ -7,6 +9,9 @@ Every rollout changes how probable the first is (Bayes' rule), by how well it wa
 fade to the policies' own records, and simulation can neither veto nor promote; and the fit is tried where the others
 fail, whatever simulation says. Where halves of the rollouts contradict each other, none of the simulator's systems is
 the real one, and only records count at once.
+
+What plays the next rollout is a trial. Deployed is by the same rule, but only among the prior as it is and policies that
+have succeeded in a rollout: an untried promise costs a rollout, never the policy that works.
 
 tests/sgft_jax/posterior/test_trust.py states the errors, for simulators of several biases.
 """
@@ -68,12 +73,18 @@ def expected(trust: Trust, promised: Array, contradicted: Array | bool = False) 
 
 
 def choice(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
-    """[] which policy to deploy. Arguments as of `expected`; promised is nan for a policy that there is not."""
+    """[] which policy to try. Arguments as of `expected`; promised is nan for a policy that there is not."""
     known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised, contradicted))
     helps = (known[CORRECTED] > _TIMES * known[AS_IS]) & (promised[CORRECTED] >= _WORKS)
     base = jnp.where(helps, CORRECTED, AS_IS)
     which = jnp.where(known[FITTED] > _TIMES * known[base], FITTED, base)
     return which.astype(jnp.int32)
+
+
+def proven(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
+    """[] which policy to deploy. Arguments as of `choice`."""
+    succeeded = (trust.won > 0).at[AS_IS].set(True)
+    return choice(trust, jnp.where(succeeded, promised, jnp.nan), contradicted)
 
 
 def _records(trust: Trust) -> Array:

@@ -98,7 +98,8 @@ def judged(
     best = best._replace(recent=recent, count=best.count + 1)
     if agent is None:
         return best
-    return _keep(best, jax.vmap(finetuner.export)(agent), recent, age, _better(recent, best))
+    played = jax.vmap(finetuner.trial or finetuner.export)(agent)
+    return _keep(best, played, recent, age, _better(recent, best))
 
 
 def _keep(best: Best, params: PyTree, window: Array, age: Array, better: Array) -> Best:

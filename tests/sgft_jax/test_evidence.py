@@ -9,7 +9,7 @@ import pytest
 
 from sgft_jax.train import evidence
 
-AGENT = SimpleNamespace(export=lambda agent: agent)
+AGENT = SimpleNamespace(export=lambda agent: agent, trial=None)
 BOOM = None  # a rollout that exploded, after two steps of -1
 judge = jax.jit(lambda *given: evidence.judged(AGENT, *given))
 
@@ -69,6 +69,12 @@ def test_a_rollout_by_nobody_known_is_in_the_windows_of_those_after_it():
     )
     assert best.params == 0 and best.score == 1
     assert best_of(3, best=best).score == 3 and best_of(3, best=best).params == 2
+
+
+def test_evidence_is_of_the_policy_that_was_tried_not_of_the_one_that_is_deployed():
+    tries = SimpleNamespace(export=lambda agent: agent, trial=lambda agent: agent + 10)
+    numbers = jnp.ones(1), jnp.ones(1), jnp.zeros(1, bool), jnp.int32(0)
+    assert evidence.judged(tries, best_of(), jnp.full(1, 3.0), *numbers).params == 13
 
 
 def evaluate(best, scores, totals, age, since=0):
