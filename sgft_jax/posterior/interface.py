@@ -103,11 +103,12 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: 
 
 
 def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
-    """The same fine-tuning, of which only that is deployed which simulation and real rollouts say is best.
+    """The same fine-tuning, of which that is tried which simulation and real rollouts say is best, and deployed once it
+    has succeeded.
 
     inner: identifies by `posterior_interface`; its exported params act by `policy`. `learn` must follow each rollout
-    once, as in `finetuning.finetune`. Metrics: posterior/deployed and posterior/tried, numbers of policies of `trust`,
-    the success that is expected of each, and posterior/contradicted, 1 where no system of the simulator is the real one.
+    once, as in `finetuning.finetune`. Metrics: posterior/deployed and posterior/tried, numbers of policies of `trust`;
+    the success that is expected of each; posterior/contradicted, 1 where no system of the simulator is the real one.
     """
 
     def init(params: PyTree, key: Key) -> Deployed:

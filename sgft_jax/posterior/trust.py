@@ -1,6 +1,4 @@
-"""Which of three policies to try, and which to deploy: real rollouts count for and against what simulation promises.
-
-Pure.
+"""Which of three policies to try, and which to deploy, by real rollouts and by what simulation promises. Pure.
 
 The three are the prior as it is, which stays for good, the prior behind the correction that does best in simulation,
 and behind the one that fits real steps best. Either the simulator is right about them, then a rollout succeeds as often
@@ -10,8 +8,8 @@ fade to the policies' own records, and simulation can neither veto nor promote; 
 fail, whatever simulation says. Where halves of the rollouts contradict each other, none of the simulator's systems is
 the real one, and only records count at once.
 
-What plays the next rollout is a trial. Deployed is by the same rule, but only among the prior as it is and policies that
-have succeeded in a rollout: an untried promise costs a rollout, never the policy that works.
+What plays the next rollout is a trial. What is deployed follows from the same rule, among the prior as it is and what
+has succeeded in a rollout: an untried promise costs a rollout, never the policy that works.
 
 tests/sgft_jax/posterior/test_trust.py states the errors, for simulators of several biases.
 """
