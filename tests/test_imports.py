@@ -67,7 +67,7 @@ ORDER = {
         *("gap_distribution", "checks", "mujoco", "control", "franka", "locomotion", "", "rollout", "adapters"),
     ),
     "sgft_jax": (
-        *("types", "keys", "checks", "stacking", "files", "math", "models", "posterior", "data", "planning"),
+        *("types", "theory", "keys", "checks", "stacking", "files", "math", "models", "posterior", "data", "planning"),
         *("learners", "policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
         *("datasets", "systems", "train"),
         *("examination", "methods", "analysis", "api", ""),

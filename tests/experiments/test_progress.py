@@ -218,5 +218,10 @@ def test_the_phases_of_every_command():
         },
         "real_demo": {"making an environment for Bullet in ..."},
         "training": {"compiling the training", "training", "evaluating", "writing a checkpoint"},
+        "theory": {
+            "solving ... systems with a ... model for H = ...",
+            "solving the pendulum on ... x ... points",
+            "solving it on half of them, to see how much the grid matters",
+        },
         "value": {"fitting V_sim of ...", "measuring it"},
     }
