@@ -61,9 +61,9 @@ class GuidanceArgs:
 
 
 class Seen(NamedTuple):
-    """States that a policy visits, [n] of everything. headroom: [n, horizons] by how much the best action exceeds V_sim.
-    surprise: r + gamma V_sim(s') - V_sim(s) of the policy's own step. value: V_sim. goal, success: whether the state is
-    one of success, and whether its episode is.
+    """States [n] that a policy visits. headroom: [n, horizons] by how much the best action exceeds V_sim. surprise: r +
+    gamma V_sim(s') - V_sim(s) of the policy's next step. value: V_sim. goal: whether the state is one of success.
+    success: whether its episode ends in one.
     """
 
     headroom: Any

@@ -198,6 +198,10 @@ def test_the_phases_of_every_command():
             "evaluating the best policies",
         },
         "gaps_run": {"playing ... episodes on each real system", "building the worlds and compiling the training"},
+        "guidance": {
+            "building ... worlds of ...",
+            "trying ... actions in ... states of each system of ...",
+        },
         "hybrid_run": {"building the worlds"},
         "kept": {"collecting ... simulated transitions of the priors"},
         "pictures": {"rendering a video"},

@@ -1,5 +1,7 @@
 """The pendulum of the paper: its dynamics by hand, friction that a torque undoes, and the course of an episode."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,7 +57,7 @@ def episode(effects, steps=3):
 def test_a_gap_is_friction_and_rewards_are_of_the_state_before():
     env, world, states = episode({})
     np.testing.assert_array_equal(world.theta.params, FRICTION)
-    for before, after in zip(states, states[1:], strict=False):
+    for before, after in itertools.pairwise(states):
         np.testing.assert_allclose(after.physics.state, moved(before.physics.state, 10.0, FRICTION), atol=1e-5)
         np.testing.assert_allclose(after.reward, pendulum.reward_of(before.physics.state), atol=1e-5)
         np.testing.assert_allclose(env.reward(before.true_obs, None, after.true_obs), after.reward, atol=1e-4)
