@@ -172,7 +172,8 @@ def fit_value(
     play = functools.partial(play_ladder, env, system, policy, pool, params, **numbers)
     keys = jax.random.split(key_play, (parts, at_once))
     rows = jax.lax.map(split_vmap(play), keys)
-    rows = whole(jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows))
+    # In so many words: where nothing varies, there is nothing to tell, and -1 would not do.
+    rows = whole(jax.tree.map(lambda x: x.reshape(parts * at_once, *x.shape[2:]), rows))
     return fit(config, rows, params.normalizer, key_fit, starts=env.episode_length)
 
 

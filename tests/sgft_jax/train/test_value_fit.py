@@ -72,6 +72,14 @@ def test_what_varies_is_what_the_value_is_told():
     ]
 
 
+def test_where_nothing_varies_the_value_is_told_nothing():
+    pool, params = envs.sample_worlds(ENV, jax.random.key(0), 4), SACParams(*[None] * 4, Normalizer(jnp.zeros(4), 1.0))
+    fit = functools.partial(value_fit.fit_value, ENV, (), policy_of(CONFIG), CONFIG)
+    value_of = jax.eval_shape(fit, pool, params, jax.random.key(1))
+    told = jax.eval_shape(lambda: value.make_v_sim(4, CONFIG.network, system=0).init(jax.random.key(0)))
+    assert jax.tree.structure(value_of) == jax.tree.structure(told)
+
+
 def test_lambda_returns_by_hand():
     rewards, discounts, values = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.5]), jnp.array([9.0, 4.0, 8.0])
     # G_1 = 2 + 0.5 * 8 = 6; G_0 = 1 + 0.5 (0.75 * 4 + 0.25 * 6) = 3.25
