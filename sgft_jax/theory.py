@@ -63,8 +63,9 @@ def optimal(system: System, gamma: float, tolerance: float = 1e-4) -> Array:
 @functools.partial(jax.jit, static_argnames=("gamma", "tolerance"))
 def followed(system: System, actions: Array, gamma: float, tolerance: float = 1e-4) -> Array:
     """[S] V^pi of the policy that takes these actions [S]."""
-    chosen = jax.tree.map(lambda x: jnp.take_along_axis(x, actions[:, None, None], axis=1), system[:2])
-    return _fixed(lambda values: backup(System(*chosen, system.reward), values, gamma)[:, 0], system, gamma, tolerance)
+    successors, odds = (jnp.take_along_axis(x, actions[:, None, None], axis=1) for x in system[:2])
+    chosen = System(successors, odds, system.reward)
+    return _fixed(lambda values: backup(chosen, values, gamma)[:, 0], system, gamma, tolerance)
 
 
 def _fixed(sweep: Callable[[Array], Array], system: System, gamma: float, tolerance: float) -> Array:
@@ -75,7 +76,7 @@ def _fixed(sweep: Callable[[Array], Array], system: System, gamma: float, tolera
         new = sweep(carry[0])
         return new, jnp.abs(new - carry[0]).max(), carry[2] + 1
 
-    return jax.lax.while_loop(on, step, (jnp.zeros_like(system.reward), jnp.inf, jnp.int32(0)))[0]
+    return jax.lax.while_loop(on, step, (jnp.zeros_like(system.reward), jnp.float32(jnp.inf), jnp.int32(0)))[0]
 
 
 def plan(system: System, guide: Array, gamma: float, horizon: int) -> Plan:
@@ -219,7 +220,8 @@ def draw_systems(key: Key, states: int, actions: int) -> tuple[System, System, S
     share, wrong = jax.random.uniform(keys[4]), jax.random.uniform(keys[5]) ** 3
     real = (1.0 - share) * parts[0] + share * parts[1]
     reward = jax.random.uniform(keys[6], (states,))
-    return (*(dense(odds, reward) for odds in (parts[0], real, (1.0 - wrong) * real + wrong * parts[2])),)
+    model = (1.0 - wrong) * real + wrong * parts[2]
+    return dense(parts[0], reward), dense(real, reward), dense(model, reward)
 
 
 def dense(odds: Array, reward: Array) -> System:
