@@ -16,7 +16,7 @@ from sgft_jax.models.distortion import Distortion, Identified, Interface, Seen, 
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
 from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, contradiction, draw, rollout_of
-from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, choice, expected, proven, update
+from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, challenger, expected, incumbent, update
 from sgft_jax.stacking import member, stack
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
 
@@ -43,15 +43,15 @@ class Believed(NamedTuple):
 
 
 class Deployed(NamedTuple):
-    """agent: the state of what adapts. first: params of the simulator's policy. tried: [] the policy of `trust` that
-    plays the next rollout, and `kept` [] the one that is deployed.
+    """agent: the state of what adapts. first: params of the simulator's policy. challenger: [] the policy of
+    `trust` that plays the next rollout. incumbent: [] the one that is deployed.
     """
 
     agent: PyTree
     first: PyTree
     trust: Trust
-    tried: Array
-    kept: Array
+    challenger: Array
+    incumbent: Array
 
 
 def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: Interface) -> Interface:
@@ -125,10 +125,10 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         return member(stack([state.first, *behind]), which)
 
     def export(state: Deployed) -> PyTree:
-        return params(state, state.kept)
+        return params(state, state.incumbent)
 
     def trial(state: Deployed) -> PyTree:
-        return params(state, state.tried)
+        return params(state, state.challenger)
 
     def act(state: Deployed, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         del explore  # nothing learns from it, and what is promised does not
@@ -138,9 +138,12 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         agent = inner.observe(state.agent, rows, valid, score)
         if score is None:  # none of the policies has played
             return state._replace(agent=agent)
-        trust, known = update(state.trust, state.tried, state.agent.interface.promised, score > 0.5), agent.interface
-        tried, kept = (rule(trust, known.promised, known.contradicted) for rule in (choice, proven))
-        return Deployed(agent, state.first, trust, tried, kept)
+        trust, known = (
+            update(state.trust, state.challenger, state.agent.interface.promised, score > 0.5),
+            agent.interface,
+        )
+        which = (rule(trust, known.promised, known.contradicted) for rule in (challenger, incumbent))
+        return Deployed(agent, state.first, trust, *which)
 
     def learn(
         state: Deployed,
@@ -155,7 +158,7 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         known = agent.interface
         successes = expected(state.trust, known.promised, known.contradicted)
         metrics |= {f"posterior/{name}": x for name, x in zip(POLICIES, successes, strict=True)}
-        facts = {"deployed": state.kept, "tried": state.tried, "contradicted": known.contradicted}
+        facts = {"deployed": state.incumbent, "tried": state.challenger, "contradicted": known.contradicted}
         metrics |= {f"posterior/{name}": x.astype(jnp.float32) for name, x in facts.items()}
         return state._replace(agent=agent), metrics
 

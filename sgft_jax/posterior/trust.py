@@ -70,8 +70,8 @@ def expected(trust: Trust, promised: Array, contradicted: Array | bool = False) 
     return jnp.where(jnp.isnan(promised), records, right * seen + (1.0 - right) * records)
 
 
-def choice(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
-    """[] which policy to try. Arguments as of `expected`; promised is nan for a policy that there is not."""
+def challenger(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
+    """[] which policy plays the next rollout. Arguments as of `expected`; promised is nan where there is none."""
     known = jnp.where(jnp.isnan(promised), -1.0, expected(trust, promised, contradicted))
     helps = (known[CORRECTED] > _TIMES * known[AS_IS]) & (promised[CORRECTED] >= _WORKS)
     base = jnp.where(helps, CORRECTED, AS_IS)
@@ -79,10 +79,10 @@ def choice(trust: Trust, promised: Array, contradicted: Array | bool = False) ->
     return which.astype(jnp.int32)
 
 
-def proven(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
-    """[] which policy to deploy. Arguments as of `choice`."""
+def incumbent(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
+    """[] which policy to deploy. Arguments as of `expected`."""
     succeeded = (trust.won > 0).at[AS_IS].set(True)
-    return choice(trust, jnp.where(succeeded, promised, jnp.nan), contradicted)
+    return challenger(trust, jnp.where(succeeded, promised, jnp.nan), contradicted)
 
 
 def _records(trust: Trust) -> Array:

@@ -77,12 +77,12 @@ def test_every_rollout_is_remembered_and_chooses_anew():
     for name in ("as_is", "corrected", "fitted"):
         assert ((metrics[f"posterior/{name}"] >= 0) & (metrics[f"posterior/{name}"] <= 1)).all()
     for which, undo in ((CORRECTED, known.distortion), (FITTED, known.fit.distortion)):
-        exported = jax.vmap(lambda state, which=which: fine.export(state._replace(kept=jnp.int32(which))))(
+        exported = jax.vmap(lambda state, which=which: fine.export(state._replace(incumbent=jnp.int32(which))))(
             progress.agent
         )
         assert exported.estimator is None and jax.tree.map(jnp.array_equal, exported.distortion, undo)
         np.testing.assert_array_equal(exported.actor["Dense_0"]["kernel"][0], prior().params.actor["Dense_0"]["kernel"])
-    exported = jax.vmap(lambda state: fine.export(state._replace(kept=jnp.int32(AS_IS))))(progress.agent)
+    exported = jax.vmap(lambda state: fine.export(state._replace(incumbent=jnp.int32(AS_IS))))(progress.agent)
     assert not exported.distortion.bias.any(), "the prior as it is corrects nothing"
 
 
@@ -112,14 +112,14 @@ def test_what_fits_real_steps_is_tried_where_the_others_fail_and_deployed_once_i
     assert jnp.isnan(known.promised[FITTED]) != fits
     lost = state._replace(trust=state.trust._replace(lost=jnp.array([9.0, 9.0, 0.0]), log_odds=jnp.float32(-9)))
     after = jax.jit(fine.observe)(lost, rows(key, 20), jnp.ones(20, bool), jnp.float32(0))
-    assert (after.tried == FITTED) == fits and after.kept == AS_IS
+    assert (after.challenger == FITTED) == fits and after.incumbent == AS_IS
     undo = after.agent.interface.fit.distortion
     assert not fits or jax.tree.all(jax.tree.map(jnp.array_equal, fine.trial(after).distortion, undo))
     metrics = fine.learn(after, key, 1, simulated())[1]
-    assert metrics["posterior/tried"] == after.tried and metrics["posterior/deployed"] == AS_IS
+    assert metrics["posterior/tried"] == after.challenger and metrics["posterior/deployed"] == AS_IS
     assert metrics["posterior/contradicted"] in (0, 1)
     won = jax.jit(fine.observe)(after, rows(key, 20), jnp.ones(20, bool), jnp.float32(1))
-    assert won.kept == after.tried
+    assert won.incumbent == after.challenger
 
 
 def test_a_log_without_success_chooses_nothing():

@@ -33,8 +33,8 @@ def fates(bias, std, *, fits):
             known = trust.update(known, which, promised, success)
             promised = jnp.clip(true + wrong + 0.03 * jax.random.normal(key_promise, (3,)), 0.0, 1.0)
             promised = promised if fits else promised.at[FITTED].set(jnp.nan)
-            which = trust.choice(known, promised)
-            return (known, which, promised), true[trust.proven(known, promised)]
+            which = trust.challenger(known, promised)
+            return (known, which, promised), true[trust.incumbent(known, promised)]
 
         start = trust.begin(), jnp.int32(AS_IS), NOTHING
         return true, jax.lax.scan(step, start, jax.random.split(key_steps, ROLLOUTS))[1]
@@ -84,17 +84,17 @@ def after(*rollouts, promised=NOTHING):
 def test_nothing_is_deployed_that_has_not_succeeded():
     promised = jnp.array([0.1, 0.9, 0.9])
     known = after((AS_IS, False), promised=promised)
-    assert trust.choice(known, promised) == CORRECTED and trust.proven(known, promised) == AS_IS
+    assert trust.challenger(known, promised) == CORRECTED and trust.incumbent(known, promised) == AS_IS
     failed, won = (trust.update(known, CORRECTED, promised, success) for success in (False, True))
-    assert trust.proven(failed, promised) == AS_IS and trust.proven(won, promised) == CORRECTED
+    assert trust.incumbent(failed, promised) == AS_IS and trust.incumbent(won, promised) == CORRECTED
 
 
 def test_one_failure_brings_a_good_prior_back():
     """The simulator thinks little of a prior that succeeds, and promises much for what fails."""
     promised = jnp.array([0.5, 0.95, jnp.nan])
     known = after((AS_IS, True))
-    assert trust.choice(known, promised) == CORRECTED
-    assert trust.choice(trust.update(known, CORRECTED, promised, False), promised) == AS_IS
+    assert trust.challenger(known, promised) == CORRECTED
+    assert trust.challenger(trust.update(known, CORRECTED, promised, False), promised) == AS_IS
 
 
 def test_a_promise_that_is_kept_is_trusted_more():
@@ -108,8 +108,8 @@ def test_rollouts_count_beside_a_promise():
     """A prior of which simulation promises two in three, but that has never failed, stays."""
     promised = jnp.array([0.66, 0.93, jnp.nan])
     once, often = after((AS_IS, True), promised=promised), after(*[(AS_IS, True)] * 5, promised=promised)
-    assert trust.choice(trust.begin(), promised) == CORRECTED
-    assert trust.choice(once, promised) == trust.choice(often, promised) == AS_IS
+    assert trust.challenger(trust.begin(), promised) == CORRECTED
+    assert trust.challenger(once, promised) == trust.challenger(often, promised) == AS_IS
     assert trust.expected(often, promised)[AS_IS] > trust.expected(once, promised)[AS_IS] + 0.05
 
 
@@ -121,28 +121,28 @@ def test_without_a_promise_only_the_record_changes():
 
 @pytest.mark.parametrize("fitted", [0.8, jnp.nan])
 def test_equal_promises_leave_the_prior(fitted):
-    assert trust.choice(trust.begin(), jnp.array([0.8, 0.8, fitted])) == AS_IS
+    assert trust.challenger(trust.begin(), jnp.array([0.8, 0.8, fitted])) == AS_IS
 
 
 def test_a_fit_is_tried_where_the_others_fail_as_promised():
     """No system of the simulator does what the real one does, and in none of them works what works there."""
     promised = jnp.array([0.05, 0.05, 0.03])
-    assert trust.choice(after(*[(AS_IS, False)] * 3, promised=promised), promised) == FITTED
+    assert trust.challenger(after(*[(AS_IS, False)] * 3, promised=promised), promised) == FITTED
 
 
 def test_where_no_correction_works_in_simulation_none_is_deployed():
     """The real system is none of these."""
-    assert trust.choice(after((AS_IS, False)), jnp.array([0.05, 0.45, jnp.nan])) == AS_IS
+    assert trust.challenger(after((AS_IS, False)), jnp.array([0.05, 0.45, jnp.nan])) == AS_IS
 
 
 def test_simulation_vetoes_a_fit_while_its_promises_are_kept():
     promised = jnp.array([0.3, 0.9, 0.4])
     known = after((AS_IS, False), (CORRECTED, True), (CORRECTED, False), (CORRECTED, True), promised=promised)
-    assert trust.choice(known, promised) == CORRECTED
+    assert trust.challenger(known, promised) == CORRECTED
 
 
 def test_rollouts_that_no_system_makes_leave_records_alone():
     promised = jnp.array([0.3, 0.95, 0.9])
     known = after((AS_IS, True), promised=promised)
-    assert trust.choice(known, promised) == CORRECTED
-    assert trust.choice(known, promised, jnp.array(True)) == AS_IS
+    assert trust.challenger(known, promised) == CORRECTED
+    assert trust.challenger(known, promised, jnp.array(True)) == AS_IS
