@@ -83,7 +83,7 @@ def outcome(home: Path) -> list[list[str]]:
     from sgft_jax.posterior.trust import POLICIES
 
     scores = {int(record["rollouts"]): record["score"][0] for record in read_jsonl(home / EVAL)}
-    words = [f"the prior {policy.replace('_', ' ')}" for policy in POLICIES]
+    words = ["the prior as it is", *(f"the prior {policy}" for policy in POLICIES[1:])]
     lines = [["0", words[0], "", f"{100 * scores[0]:.0f} %", words[0]]]
     for record in read_jsonl(home / METRICS):
         kept, tried = (int(record[f"posterior/{name}"][0]) for name in ("deployed", "tried"))

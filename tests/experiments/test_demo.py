@@ -53,7 +53,8 @@ def test_the_demo_tells_what_rollouts_say_of_the_system(tmp_path, monkeypatch, c
     assert -0.85 < low < -0.75 and 0.75 < high < 0.85  # 80 % of what it may be
     rollouts = [row for row in tables if re.match(r"\| \d", row[0])]
     assert [row[0] for row in rollouts] == ["| 0", "| 1", "| 2"] and rollouts[0][1] == "the prior as it is"
-    assert all(row[3].endswith("% |") for row in rollouts) and list((tmp_path / "demo").rglob("posterior.png"))
+    assert all(row[3].endswith("%") and row[4].startswith("the prior ") for row in rollouts)
+    assert list((tmp_path / "demo").rglob("posterior.png"))
 
 
 @pytest.mark.parametrize(
