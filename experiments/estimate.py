@@ -1,7 +1,7 @@
 """Give priors an estimator: a network that says which systems may have made real rollouts, for method `posterior`.
 
 It learns in simulation alone: systems are drawn from what a real one may be, and the priors' policies play ten rollouts
-in each, on a GPU a quarter of them in MuJoCo's own engine. Priors that play one task share what is learned. Ten to
+in each, on a GPU an eighth of them in MuJoCo's own engine. Priors that play one task share what is learned. Ten to
 twenty minutes on a GPU.
 """
 

@@ -37,7 +37,7 @@ def learned(
     """An estimator that has learned from so many systems, `updates` times for each number of rollouts that are read
     together, and by how many nats so many rollouts make it surer of other systems.
 
-    simulators: of one task in one or two engines; the second makes a quarter of the systems. Real contacts are those of
+    simulators: of one task in one or two engines; the second makes an eighth of the systems. Real contacts are those of
     no engine, so it must not know one by heart. params: of the priors whose policies play in turn.
     """
     key_play, key_start, key_learn = jax.random.split(jax.random.key(_SEED), 3)
