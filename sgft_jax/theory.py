@@ -110,8 +110,8 @@ def lowered(system: System, guide: Array, gamma: float) -> Array:
     return guide - short / (1.0 - gamma)
 
 
-def constants(real: System, model: System, guide: Array, gamma: float) -> Constants:
-    """What the bounds need of a real system, the model that plans, and V_sim [S]."""
+def constants(real: System, model: System, guide: Array, best: Array) -> Constants:
+    """What the bounds need of a real system, the model that plans, V_sim [S] and V_real^* [S]."""
 
     def distance(real: tuple[Array, Array], model: tuple[Array, Array]) -> Array:
         states = jnp.concatenate([real[0], model[0]])
@@ -123,8 +123,7 @@ def constants(real: System, model: System, guide: Array, gamma: float) -> Consta
         return jax.vmap(distance)(*rows).max()
 
     alpha = jax.lax.map(worst, ((*real[:2],), (*model[:2],)), batch_size=64).max()
-    spread, error = jnp.ptp(guide), jnp.abs(guide - optimal(real, gamma)).max()
-    return Constants(jnp.ptp(real.reward), spread, alpha, error)
+    return Constants(jnp.ptp(real.reward), jnp.ptp(guide), alpha, jnp.abs(guide - best).max())
 
 
 def lemma_1(c: Constants, gamma: float, horizon: int, *, printed: bool = False) -> Array:
@@ -197,16 +196,16 @@ def measure(real: System, model: System, guide: Array, gamma: float, horizon: in
     plans = jnp.stack([planned.actions, anything])
     promised, played = (jax.vmap(lambda plan, s=s: worth(s, plan, guide, gamma))(plans) for s in (model, real))
     actions, most = planned.actions[-1], best.values[-1]
-    q = backup(real, best.values[-2] + guide, gamma) - guide[:, None]
+    q, value = backup(real, best.values[-2] + guide, gamma) - guide[:, None], optimal(real, gamma)
     return Measured(
-        constants=constants(real, model, guide, gamma),
+        constants=constants(real, model, guide, value),
         improvability=best.values[1].min(),
         apart=jnp.abs(promised - played).max(),
         plan=(most - played[0]).max(),
         any_plan=(most[None] - played).max(),
         growth=(best.values[1:] - best.values[:-1]).min(),
         first=(most - jnp.take_along_axis(q, actions[:, None], axis=1)[:, 0]).max(),
-        policy=(optimal(real, gamma) - followed(real, actions, gamma)).max(),
+        policy=(value - followed(real, actions, gamma)).max(),
     )
 
 

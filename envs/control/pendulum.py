@@ -18,7 +18,7 @@ from envs.types import Array, Key
 __all__ = ["DT", "FASTEST", "TORQUE", "friction", "make", "move", "reward_of"]
 
 DT, GRAVITY, LENGTH = 0.05, 9.81, 1.0  # s, m/s^2, m
-TORQUE = 20.0  # 1/s^2 at full command: a mass of 1 kg on 1 m
+TORQUE = 20.0  # rad/s^2 at full command
 FASTEST = 6.0  # rad/s
 STEPS = 100
 SHARP = 10.0  # s/rad: dry friction turns round within .1 rad/s
@@ -113,10 +113,10 @@ def _begun(start: Array, effects: Effects) -> EnvState:
 def _step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
     key_noise, key_command, key_late = jax.random.split(key, 3)
     effects, before = state.effects, state.physics
-    command = shake(effects, distort(effects, action), key_command)
+    command = jnp.clip(shake(effects, distort(effects, action), key_command), -1.0, 1.0)
     jitter = jax.random.uniform(key_late, minval=-1.0) * effects.latency_jitter
     late = jnp.clip((effects.latency + jitter) / DT, 0.0, 1.0)
-    torque = TORQUE * (late * before.command + (1.0 - late) * jnp.clip(command, -1.0, 1.0))[0]
+    torque = TORQUE * (late * before.command + (1.0 - late) * command)[0]
     after = move(before.state, torque, world.theta.params)
     obs, time = _seen(after), state.time + 1
     return state._replace(

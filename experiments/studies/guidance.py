@@ -30,10 +30,12 @@ from experiments.runner.progress import doing
 from experiments.runner.real_systems import by_scene, title
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
+from sgft_jax.api import check_prior
 from sgft_jax.diagnosis import draw_offsets, guidance
 from sgft_jax.io.log import write_summary
 from sgft_jax.io.priors import load_prior, variant
 from sgft_jax.io.runs import check_folder
+from sgft_jax.methods import get_method
 from sgft_jax.types import Prior
 
 _HORIZONS = (1, 4)
@@ -82,10 +84,11 @@ def main(args: GuidanceArgs) -> None:
     task = prior.card["task"]
     folder = args.out / "guidance" / task
     check_folder(folder)
+    if not args.real:
+        raise UserError("--real: name at least one")
     env = envs.make(task, args.impl, **variant(prior.card))
+    check_prior(prior, get_method("sgft"), env)  # it has a V_sim
     policy = make_policy(prior.card, env)
-    if policy.value is None or not args.real:
-        raise UserError(f"--prior {args.prior}: has no V_sim" if args.real else "--real: name at least one")
     names = [SIM, *(name for name in gaps.expand(args.real) if name != SIM)]
     seen = {name: x for group in by_scene(task, names) for name, x in _seen(args, env, policy, prior, group).items()}
     margin = 1.48 * float(np.median(np.abs(seen[SIM].surprise)))
@@ -121,29 +124,22 @@ def _look(
     env: Env, policy: Policy, gamma: float, actions: int, params: PyTree, pool: World, which: Array, keys: Key
 ) -> Seen:
     """keys: [n], of an episode each, in which one state is looked at."""
+    assert policy.value is not None  # as `main` has asked
+    value = functools.partial(policy.value, params)
 
     def one(key: Key) -> Seen:
         key_episode, key_stop, key_offsets, key_steps = jax.random.split(key, 4)
         stop = jax.random.randint(key_stop, (), 0, env.episode_length)
         world, state, success = _visit(env, policy, params, pool, which, key_episode, stop)
         offsets = draw_offsets(key_offsets, actions, env.act_dim)
-        value = functools.partial(_value(policy), params)
-        along = functools.partial(_along, env, policy, params, value, gamma, world, state, keys=_steps(key_steps))
+        keys = jax.random.split(key_steps, max(_HORIZONS))
+        along = functools.partial(_along, env, policy, params, value, gamma, world, state, keys=keys)
         exceeds = jax.vmap(along)(offsets)
         best = jnp.stack([exceeds[:, h - 1].max() for h in _HORIZONS])
         # The first offset is none: what the policy itself would do.
         return Seen(best, exceeds[0, 0], value(state.true_obs), state.success, success)
 
     return jax.lax.map(one, keys, batch_size=_AT_ONCE)
-
-
-def _value(policy: Policy) -> Callable[[PyTree, Array], Array]:
-    assert policy.value is not None  # as `main` has asked
-    return policy.value
-
-
-def _steps(key: Key) -> Key:
-    return jax.random.split(key, max(_HORIZONS))
 
 
 def _visit(

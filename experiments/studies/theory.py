@@ -83,12 +83,15 @@ def _text(value: Any) -> str:
 def _bounds(args: TheoryArgs, folder: Path) -> tuple[list[dict[str, Any]], Path]:
     """A line for each kind of system, model and horizon: how many systems break a bound, or make it vacuous."""
     lines = []
+    with doing("solving the pendulum of the bounds", 10, once=True):
+        swung = _solve(_COARSE)
+        models = {"right": swung.real, "wrong": _system(swung.axes, pendulum.TORQUE, (0.0, 0.0))}  # without friction
     for systems, gamma in (("random", _GAMMA), ("pendulum", _DISCOUNT)):
         for model in _MODELS:
             for horizon in args.horizons:
                 with doing(f"solving {systems} systems with a {model} model for H = {horizon}", 10, once=True):
                     keys = jax.random.split(jax.random.key(horizon), args.systems)
-                    x = _random(keys, horizon, model) if systems == "random" else _swung(horizon, model)
+                    x = _random(keys, horizon, model) if systems == "random" else _one(swung, models[model], horizon)
                 about = {"systems": systems, "model": model, "H": horizon}
                 lines.append(about | _judged(jax.tree.map(np.asarray, x), horizon, gamma))
     return lines, _draw_bounds(folder / "bounds.png", lines)
@@ -106,14 +109,10 @@ def _random(keys: Array, horizon: int, model: str) -> Measured:
     return jax.jit(jax.vmap(one))(keys)
 
 
-def _swung(horizon: int, model: str) -> Measured:
-    """[1] of the pendulum; the wrong model knows nothing of friction."""
-    axes = _axes(_COARSE)
-    value = theory.optimal(_system(axes, _SIMULATED, (0.0, 0.0)), _DISCOUNT)
-    real, wrong = (_system(axes, pendulum.TORQUE, friction) for friction in (_FRICTION, (0.0, 0.0)))
+def _one(x: "_Solved", model: System, horizon: int) -> Measured:
+    """[1] of the pendulum."""
     solve = jax.jit(functools.partial(theory.measure, gamma=_DISCOUNT, horizon=horizon))
-    measured = solve(real, {"right": real, "wrong": wrong}[model], value, key=jax.random.key(0))
-    return jax.tree.map(lambda x: x[None], measured)
+    return jax.tree.map(lambda x: x[None], solve(x.real, model, x.value, key=jax.random.key(0)))
 
 
 def _judged(x: Measured, horizon: int, gamma: float) -> dict[str, Any]:
@@ -210,8 +209,7 @@ def _reached(x: _Solved) -> list[dict[str, Any]]:
     angles, speeds = np.meshgrid(*x.axes, indexing="ij")
     near = ((np.abs(angles) <= _NEAR) & (np.abs(speeds) <= _NEAR)).ravel()
 
-    def line(policy: str, system: System, values: Array) -> dict[str, Any]:
-        least = np.asarray(theory.improvability(system, x.value, _DISCOUNT))
+    def line(policy: str, least: np.ndarray, values: Array) -> dict[str, Any]:
         share = {"improvable states": float((least >= -_DRIFT).mean()), "at the worst state": float(least.min())}
         return {"policy": policy, "return": float(np.asarray(values)[near].mean()), **share}
 
@@ -219,11 +217,12 @@ def _reached(x: _Solved) -> list[dict[str, Any]]:
         return theory.followed(system, theory.plan(system, x.value, _DISCOUNT, horizon).actions[-1], _DISCOUNT)
 
     first = theory.plan(x.simulator, x.value, _DISCOUNT, 1).actions[0]
+    tight, real = (np.asarray(theory.improvability(system, x.value, _DISCOUNT)) for system in (x.tight, x.real))
     return [
-        line("the simulator's, as it is", x.tight, theory.followed(x.tight, first, _DISCOUNT)),
-        line("guided by V_sim, H = 1, no more torque", x.tight, guided(x.tight, 1)),
-        *(line(f"guided by V_sim, H = {h}", x.real, guided(x.real, h)) for h in (1, 4)),
-        line("the best", x.real, theory.optimal(x.real, _DISCOUNT)),
+        line("the simulator's, as it is", tight, theory.followed(x.tight, first, _DISCOUNT)),
+        line("guided by V_sim, H = 1, no more torque", tight, guided(x.tight, 1)),
+        *(line(f"guided by V_sim, H = {h}", real, guided(x.real, h)) for h in (1, 4)),
+        line("the best", real, theory.optimal(x.real, _DISCOUNT)),
     ]
 
 

@@ -224,6 +224,7 @@ def test_the_phases_of_every_command():
         "training": {"compiling the training", "training", "evaluating", "writing a checkpoint"},
         "theory": {
             "solving ... systems with a ... model for H = ...",
+            "solving the pendulum of the bounds",
             "solving the pendulum on ... x ... points",
             "solving it on half of them, to see how much the grid matters",
         },

@@ -58,7 +58,7 @@ def test_lemma_1_as_printed_fails_where_the_model_misses_one_step():
     real, model, guide = two_states(0.5), two_states(0.8), jnp.array([0.0, 1.0])
     still = jnp.zeros((1, 2), jnp.int32)
     apart = jnp.abs(theory.worth(real, still, guide, GAMMA) - theory.worth(model, still, guide, GAMMA)).max()
-    c = theory.constants(real, model, guide, GAMMA)
+    c = theory.constants(real, model, guide, theory.optimal(real, GAMMA))
     np.testing.assert_allclose([apart, c.model], [GAMMA * 0.3, 0.6], rtol=1e-5)
     np.testing.assert_allclose(theory.lemma_1(c, GAMMA, 1), apart, rtol=1e-5)
     assert theory.lemma_1(c, GAMMA, 1, printed=True) < 0.95 * apart
@@ -66,7 +66,8 @@ def test_lemma_1_as_printed_fails_where_the_model_misses_one_step():
 
 def test_lemma_2_as_printed_does_not_shrink_with_the_error_of_the_model():
     real, guide = two_states(0.5), jnp.array([0.0, 1.0])
-    near, far = (theory.constants(real, two_states(p), guide, GAMMA) for p in (0.5, 0.9))
+    value = theory.optimal(real, GAMMA)
+    near, far = (theory.constants(real, two_states(p), guide, value) for p in (0.5, 0.9))
     assert theory.lemma_2(near, GAMMA, 4) < 1e-5 < theory.lemma_2(far, GAMMA, 4)
     assert theory.lemma_2(near, GAMMA, 4, printed=True) == theory.lemma_2(far, GAMMA, 4, printed=True) > 0.5
 

@@ -70,6 +70,11 @@ def test_a_late_command_is_the_one_before():
     np.testing.assert_allclose(after.physics.state, moved(before.physics.state, 0.2, FRICTION), atol=1e-5)
 
 
+def test_the_torque_has_a_limit_also_where_it_is_late():
+    _, _, (_, before, after) = episode({"action_bias": 0.9, "latency": 0.02}, steps=2)
+    np.testing.assert_allclose(after.physics.state, moved(before.physics.state, 20.0, FRICTION), atol=1e-5)
+
+
 def test_an_episode_ends_by_time_and_success_is_upright_and_still():
     env, world, (start, *_) = episode({}, steps=0)
     late = start._replace(time=jnp.int32(98))
