@@ -30,6 +30,10 @@ TASKS = {
     "metaworld-hammer": "envs.franka.metaworld_hammer",
     "halfcheetah": "envs.locomotion.halfcheetah",
     "walker2d": "envs.locomotion.walker2d",
+    "walker-walk": "envs.locomotion.walker_walk",
+    "walker-walk-du": "envs.locomotion.walker_walk_du",
+    "cheetah-run": "envs.locomotion.cheetah_run",
+    "cheetah-run-du": "envs.locomotion.cheetah_run_du",
     "wheel-legged": "envs.locomotion.wheel_legged",
     "wheel-legged-forward": "envs.locomotion.wheel_forward",
 }

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Env, Parameter
+from envs.control.suite import bell
 from envs.mujoco.engines import Engine
 from envs.mujoco.parts import add_hinge, add_motor, add_slide, empty_spec
 from envs.mujoco.scene import Scene, View, make_env
@@ -122,15 +123,10 @@ def frame_reward(x: Array, upright: Array, spin: Array, action: Array) -> Array:
 
     x, upright (a cosine), spin: [] after the frame; action: [1].
     """
-    centred = (1 + _tail(x / CART_MARGIN)) / 2
-    calm = (1 + _tail(spin / SPIN_MARGIN)) / 2
+    centred = (1 + bell(x / CART_MARGIN)) / 2
+    calm = (1 + bell(spin / SPIN_MARGIN)) / 2
     gentle = (4 + jnp.maximum(1 - action[0] ** 2, 0.0)) / 5
     return (upright + 1) / 2 * centred * calm * gentle
-
-
-def _tail(distance: Array) -> Array:
-    """A bell that is 0.1 at distance 1."""
-    return jnp.exp(jnp.log(0.1) * distance**2)
 
 
 def halfway(obs: Array, next_obs: Array) -> tuple[Array, Array, Array]:

@@ -92,20 +92,8 @@ def lead(pose: Array) -> Array:
     Only the floor moves that point between two steps, while the root swings with the legs: its way can be told from
     speeds.
     """
-    frames = {"torso": (jnp.zeros(2), pose[0])}  # origin (x, z) and turn of every body
-    moments = [capsule.volume * _turned(capsule.center, pose[0])[0] for capsule in (TORSO, HEAD)]
-    for link, angle in zip(LINKS, pose[1:], strict=True):
-        origin, turn = frames[link.parent]
-        frames[link.name] = origin, turn = origin + _turned(link.position, turn), turn + angle
-        moments.append(link.capsule.volume * (origin + _turned(link.capsule.center, turn))[0])
-    volumes = [capsule.volume for capsule in (TORSO, HEAD, *(link.capsule for link in LINKS))]
-    return jnp.sum(jnp.stack(moments)) / sum(volumes)
-
-
-def _turned(point: tuple[float, float], angle: Array) -> Array:
-    """(x, z) [2] of a point in a frame that is turned about +y."""
-    (x, z), cos, sin = point, jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([x * cos + z * sin, z * cos - x * sin])
+    volumes = jnp.array([TORSO.volume + HEAD.volume, *(link.capsule.volume for link in LINKS)])
+    return planar.lead((TORSO, HEAD), LINKS, 1, volumes, pose)
 
 
 SCENE = planar.scene(

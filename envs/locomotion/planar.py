@@ -4,13 +4,14 @@ They are the `-v2` systems of OpenAI Gym that D4RL was recorded on. A domain par
 so all are 1 there.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from envs.base import NOTHING, Entry, Parameter
 from envs.mujoco import parts
@@ -133,6 +134,51 @@ def add_link(
     add_hinge(body, [0, axis, 0], name=link.name, pos=[anchor_x, 0, anchor_z], **spring, **limit)
     add_capsule(spec, body, link.name, link.capsule, **geom)
     add_motor(spec, link.name, link.name, link.gear)
+
+
+def pitches(links: Sequence[Link], axis: float, pose: Array) -> Array:
+    """[1 + links] rad about +y, of the torso and of the links on hinges about +y or -y (axis: 1 or -1).
+
+    pose: [1 + links] rad, the pitch and the joints.
+    """
+    turns = {"torso": pose[0]}
+    for link, angle in zip(links, pose[1:], strict=True):
+        turns[link.name] = turns[link.parent] + axis * angle
+    return jnp.stack(list(turns.values()))
+
+
+def joints(links: Sequence[Link], axis: float, turns: Array) -> Array:
+    """The pose [1 + links] of these `pitches`, joints between -pi and pi."""
+    by_name = dict(zip(("torso", *(link.name for link in links)), turns, strict=True))
+    angles = jnp.stack([axis * (by_name[link.name] - by_name[link.parent]) for link in links])
+    return jnp.concatenate([turns[:1], jnp.mod(angles + jnp.pi, 2 * jnp.pi) - jnp.pi])
+
+
+def lead(trunk: Sequence[Capsule], links: Sequence[Link], axis: float, masses: Array, pose: Array) -> Array:
+    """How far ahead of the root the centre of mass is, [] m.
+
+    trunk: capsules of the torso, all of one density. axis: of the hinges, see `add_link`. masses: [1 + links], in any
+    unit, the torso's first. pose: see `pitches`.
+    """
+    turns = dict(zip(("torso", *(link.name for link in links)), pitches(links, axis, pose), strict=True))
+    volumes = [capsule.volume for capsule in trunk]
+    middle = np.average([capsule.center for capsule in trunk], axis=0, weights=volumes)
+    origins = {"torso": jnp.zeros(2)}
+    centers = [_turned(middle, pose[0])[0]]
+    for link in links:
+        hinge = np.add(link.position, link.anchor)  # in the frame of the parent
+        turn, parent = turns[link.name], link.parent
+        origin = origins[parent] + _turned(hinge, turns[parent]) - _turned(link.anchor, turn)
+        origins[link.name] = origin
+        centers.append((origin + _turned(link.capsule.center, turn))[0])
+    return jnp.sum(masses * jnp.stack(centers)) / jnp.sum(masses)
+
+
+def _turned(point: ArrayLike, angle: Array) -> Array:
+    """(x, z) [2] of a point in a frame that is turned about +y."""
+    x, z = np.asarray(point)
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([x * cos + z * sin, z * cos - x * sin])
 
 
 def _tint(name: str) -> list[float]:
