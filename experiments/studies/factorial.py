@@ -2,7 +2,8 @@
 
 Every cell is a run of `sgft-parts` with equal branches. Cells that are finished are left alone, begun ones go on where
 they stopped. When all are finished, the learning curve of every cell and the effects of each part on area, end and
-deepest fall are printed, and the effects are drawn. With --data, nothing runs: the curves come from released tables.
+deepest fall are printed; the effects are drawn, and the curves of the cells that are as the paper prints them. With
+--data, nothing runs: the curves come from released tables.
 """
 
 import itertools
@@ -161,7 +162,7 @@ def released(args: FactorialArgs, folder: Path, places: Sequence[Place]) -> Curv
 
 
 def report(args: FactorialArgs, curves: Curves) -> str:
-    """Tables of the cells and of the effects; writes factorial.json and factorial.png."""
+    """Tables of the cells and of the effects; writes factorial.json, factorial.png and as-printed.png."""
     from sgft_jax.analysis import figures  # brings Matplotlib
 
     folder, names, by_place, texts, score = args.out / "factorial", list(factors(args)), {}, [], ""
@@ -184,7 +185,19 @@ def report(args: FactorialArgs, curves: Curves) -> str:
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "factorial.json", jsonable(by_place))
     figures.effects(folder / "factorial.png", by_place, label=f"change of {score}")
+    panels = {f"{task}, {gaps.title(real)}": as_printed(args, runs) for (task, real), runs in curves.items()}
+    figures.learning_curves(folder / "as-printed.png", panels, title="A new critic and no warm-up, as in the paper")
     return "\n\n".join([*texts, f"written: {folder}"])
+
+
+def as_printed(args: FactorialArgs, curves: dict[Levels, Curve]) -> list[Curve]:
+    """With a new critic and no warm-up, the cell with neither part and those with both."""
+    cells = {
+        "task reward": (False, False, False, True, False),
+        "SGFT, H = 1": (True, True, False, True, False),
+        f"SGFT, H = {args.horizon}": (True, True, True, True, False),
+    }
+    return [replace(curves[levels], method=name, variant="") for name, levels in cells.items()]
 
 
 def _cells(args: FactorialArgs, curves: dict[Levels, Curve]) -> str:
