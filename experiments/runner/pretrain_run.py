@@ -305,11 +305,11 @@ class _Run(Training):
         """V_sim, priors with their cards, report, figures, summary, closing words."""
         report = None
         if self.fits:
-            with self.clock("value"), doing("fitting V_sim", 40, once=True):
+            with self.clock("value"), doing("fitting V_sim", 20 + 20 * len(self.seeds), once=True):
                 best = self._value(best)
         with self.clock("report"):
             if self.reports:
-                with doing("measuring V_sim and the models", 20, once=True):
+                with doing("measuring V_sim and the models", 15 + 5 * len(self.seeds), once=True):
                     report, held, judged = self._report(best.params)
             with doing("playing fresh episodes for the cards", 5):
                 played = self._final_episodes(best.params)

@@ -150,7 +150,7 @@ def test_a_run_says_what_it_is_doing(short, out):
         "evaluating (about 15 s, once)",
         "training",
         "writing a checkpoint",
-        "fitting V_sim (about 40 s, once)",
+        "fitting V_sim (about 60 s, once)",
         "playing fresh episodes for the cards (about 5 s)",
     ]
     assert "still collecting 2,048 random transitions (0:00:01 so far, compiling)" in words
@@ -272,7 +272,7 @@ def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
     [
         (
             ["--task", "toi"],
-            "task: there is no 'toi', did you mean 'toy'? Choose from: halfcheetah, hammer, insert, metaworld-hammer,",
+            "task: there is no 'toi', did you mean 'toy'? Choose from: cheetah-run, cheetah-run-du, halfcheetah,",
         ),
         (["--preset", "fats"], "--preset: there is no 'fats', did you mean 'fast'? Choose from: cpu, fast, informed"),
         (["--config.gama", "0.9"], "did you mean --config.gamma?"),
