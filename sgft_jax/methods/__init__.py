@@ -23,7 +23,7 @@ Kind = Literal["online", "fixed"]
 _ORDER = (
     *("guarded", "posterior", "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "sgft", "tdmpc2", "mbpo", "sysid"),
     *("recurrent",),
-    *("h2oplus", "h2oplus-edac", "h2o", "darc", "sac", "rlpd", "sac-online", "iql", "cql", "rebrac", "edac"),
+    *("h2oplus", "h2oplus-edac", "h2o", "darc", "sac", "rlpd", "wsrl", "sac-online", "iql", "cql", "rebrac", "edac"),
     *("sac-reset", "pbrs", "pbrs-branch", "frozen-critic", "sgft-tdmpc2-code", "sgft-parts"),
 )
 _FILES = (module.name for module in pkgutil.iter_modules(__path__) if module.name != "options")
