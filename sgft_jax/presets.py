@@ -66,6 +66,8 @@ class PretrainConfig(checks.Checked):
     random_transitions: checks.Count = 500_000
     """Transitions under random actions, collected first: they give the observation statistics and a part of every
     batch. Where an environment would make more than 3,125 steps, a multiple of n-envs collects them."""
+    normalize: bool = True
+    """Networks read observations in units of the statistics of random actions; the paper's do not on insert."""
     random_fraction: checks.BelowOne = 0.5
     """Share of each batch that comes from the random actions (paper: 0.5)."""
     random_ladder: checks.Share = 0.0

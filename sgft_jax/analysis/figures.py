@@ -305,6 +305,22 @@ def shrinking(path: Path, names: Sequence[str], truth: np.ndarray, intervals: np
     return _save(figure, path, title)
 
 
+def landscape(
+    path: Path, x: np.ndarray, y: np.ndarray, values: np.ndarray, points: Mapping[str, np.ndarray], *, title: str
+) -> Path:
+    """A value [y, x] over places in m, and points [n, 2] by what they are."""
+    figure, (axes,) = _figure(7.0, 5.4, 1)
+    axes.grid(visible=False)
+    mesh = axes.pcolormesh(x, y, values, cmap="Greens", shading="gouraud", zorder=-1)
+    figure.colorbar(mesh, ax=axes, shrink=0.8).outline.set_visible(False)
+    for (name, places), colour in zip(points.items(), (PALETTE[1], PALETTE[0], _INK), strict=False):
+        axes.plot(*places.T, "o", color=colour, markersize=6 if len(places) == 1 else 4, label=name, clip_on=True)
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal", ylabel="y, m")
+    _name(axes, "", "x, m")
+    axes.legend(frameon=True, fontsize=9, labelcolor=_INK)
+    return _save(figure, path, title)
+
+
 def _name(axes: Axes, title: str, x: str = "") -> None:
     """What a panel shows, and what its x axis is."""
     axes.set_title(title, **_FONT, loc="left")

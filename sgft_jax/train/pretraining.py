@@ -233,6 +233,8 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
     kept = recipe.memory
 
     def begin(agent: PyTree, random: PyTree) -> PyTree:
+        if not config.normalize:
+            return agent
         statistics = normalizer.update(normalizer.init(env.obs_dim), random.data.obs, kept.held(random))
         return agent.replace(normalizer=normalizer.finish(statistics))
 

@@ -203,6 +203,7 @@ def test_the_phases_of_every_command():
             "trying ... actions in ... states of each system of ...",
         },
         "hybrid_run": {"building the worlds"},
+        "landscape": {"playing an episode of ..."},
         "kept": {"collecting ... simulated transitions of the priors"},
         "pictures": {"rendering a video"},
         "posterior": {

@@ -159,6 +159,9 @@ def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
     assert statistics.mean[0] == pytest.approx(seen.mean(), rel=1e-4)
     assert statistics.std[0] == pytest.approx(seen.std(), rel=1e-4)
     assert seen.mean() < -0.02
+    plain = pretraining.make_trainer(env, replace(CONFIG, normalize=False))
+    left = jax.jit(plain.init)(pool, random, jax.random.key(2)).learner.normalizer
+    assert left.mean[0] == 0.0 and left.std[0] == 1.0
 
 
 @pytest.mark.heavy
