@@ -73,11 +73,11 @@ def main(args: LandscapeArgs) -> None:
     imagined = _imagined(env, prior, path, key_imagine, args.branches, args.horizon)
     shown = np.concatenate([path[:, :2], path[:1, 2:4], imagined])
     ends = zip(shown.min(axis=0) - _MARGIN, shown.max(axis=0) + _MARGIN, strict=True)
-    sides = [np.linspace(*pair, _GRID) for pair in ends]
-    values = _values(env, prior, path[0], *sides)
+    x, y = (np.linspace(low, high, _GRID) for low, high in ends)
+    values = _values(env, prior, path[0], x, y)
     title = f"V_sim of {env.name} by where the hand is, while the puck rests"
     drawn = {"rollout": path[:, :2], "imagined": imagined, "puck": path[:1, 2:4]}
-    print(figures.landscape(folder / f"{env.name}.png", *sides, values, drawn, title=title))
+    print(figures.landscape(folder / f"{env.name}.png", x, y, values, drawn, title=title))
 
 
 def _path(env: Env, prior: Prior, pool: World, key: Key) -> np.ndarray:
@@ -116,11 +116,11 @@ def _imagined(env: Env, prior: Prior, path: np.ndarray, key: Key, branches: int,
 
 def _values(env: Env, prior: Prior, start: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """[y, x] V_sim with the hand there and all else as at the start."""
-    policy = make_policy(prior.card, env)
-    assert policy.value is not None  # as `main` has asked
+    v_sim = make_policy(prior.card, env).value
+    assert v_sim is not None  # as `main` has asked
 
     def value(x: Array, y: Array) -> Array:
-        return policy.value(prior.params, jnp.asarray(start).at[:2].set(jnp.stack([x, y])))
+        return v_sim(prior.params, jnp.asarray(start).at[:2].set(jnp.stack([x, y])))
 
     return np.asarray(jax.jit(jax.vmap(jax.vmap(value, (0, None)), (None, 0)))(jnp.asarray(x), jnp.asarray(y)))
 
