@@ -46,6 +46,8 @@ class PretrainConfig(checks.Checked):
     sees_system: bool = False
     """End the observation of all networks with what varies between episodes of the training domain, parameters and
     effects. Such a prior is for the method `sysid`, which tells it what it has identified."""
+    blind_actor: bool = False
+    """Hide the system from the actor: an asymmetric actor-critic, for the method `asymmetric`."""
     system_noise: checks.NotNegative = 0.3
     """Std of the noise on that in training, where each number's range is [-1, 1]; new at every step. Without it,
     networks of few episodes learn to tell these apart (docs/methods.md)."""
@@ -119,6 +121,10 @@ class PretrainConfig(checks.Checked):
         if self.sees_system and self.algorithm != "sac":
             wanted = f"off for a prior of {self.algorithm}, which no method could tell anything"
             raise checks.refusal("sees_system", True, wanted)
+        if self.blind_actor and not self.sees_system:
+            raise checks.refusal("blind_actor", True, "off where sees-system is off: there is nothing to hide")
+        if self.network.blind and not self.blind_actor:
+            raise checks.refusal("network.blind", self.network.blind, "0: blind-actor sets it")
         for name in ("random_transitions", "replay_capacity"):
             if getattr(self, name) < self.n_envs:
                 wanted = f"at least n-envs = {self.n_envs}, one step of all environments"
@@ -195,6 +201,7 @@ PRESETS: dict[str, PretrainConfig] = {
     "robust": _ROBUST,
     # The same, told what differs: for the method `sysid`, which identifies it.
     "informed": replace(_ROBUST, sees_system=True, system_noise=0.1),
+    "asymmetric": replace(_ROBUST, sees_system=True, system_noise=0.0, blind_actor=True),
     # The paper's numbers (Appendix C): one update of batch 256 per environment step, 2 x 512 units, alpha from 1.
     "paper": PretrainConfig(
         n_envs=64,
@@ -252,6 +259,8 @@ PRESETS: dict[str, PretrainConfig] = {
 
 def preset_of(method: Online) -> str:
     """The preset that makes the priors which a method needs."""
+    if method.blind_actor:
+        return "asymmetric"
     return "informed" if method.sees_system else get_algorithm(method.prior).preset
 
 
@@ -263,6 +272,11 @@ def check_card(card: Mapping[str, Any], method: Online, task: str) -> None:
     if method.sees_system != bool(card.get("system")):
         negation = "" if method.sees_system else "not "
         raise UserError(f"{method.name} needs a prior that was {negation}told the system; make one with: {command}")
+    if method.blind_actor != bool((card.get("network") or {}).get("blind")):
+        negation = "not " if method.blind_actor else ""
+        raise UserError(
+            f"{method.name} needs a prior whose actor is {negation}told the system; make one with: {command}"
+        )
     if card["task"] != task:
         raise UserError(f"the prior is of the task {card['task']!r}, not of {task!r}")
 

@@ -327,7 +327,8 @@ class Online(NamedTuple):
     build(config, prior, task) -> Finetuner. Every option left open (None) is resolved here.
     prior: the algorithm of the priors that it starts from. needs_prior: False where it can start without one.
     zero_shot: whether it begins as its prior acts; False where it plans otherwise or begins from nothing.
-    sees_system: True where these priors must see which system they are in, as no others may.
+    sees_system: True where these priors must see which system they are in, as no others may. blind_actor: whether their
+        actors must not.
     name: of the method; `methods.get_method` fills it in.
     """
 
@@ -340,6 +341,7 @@ class Online(NamedTuple):
     needs_prior: bool = True
     zero_shot: bool = True
     sees_system: bool = False
+    blind_actor: bool = False
     name: str = ""
 
 

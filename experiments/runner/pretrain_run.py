@@ -8,6 +8,7 @@ import importlib
 import math
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -84,6 +85,9 @@ def run(args: "PretrainArgs", seeds: list[int], home: Path) -> dict[str, Any]:
     if args.config.sees_system:
         seeing = with_system(env, varying(env, gap.params, gap.effects) if gap else varying(env))
         env = blurred(seeing, args.config.system_noise)
+    if args.config.blind_actor:
+        network = replace(args.config.network, blind=len(env.system))
+        args = replace(args, config=replace(args.config, network=network))
     sizes = pretraining.memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     with folder_of_host(home) as folder, mesh.use(devices):
@@ -412,8 +416,10 @@ class _Run(Training):
             print(line)
         files = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (folder / name).exists())
         print(f"results: {folder}  ({files})")
-        wanted = self.config.algorithm, self.config.sees_system
-        methods = [name for name, way in all_methods().items() if (way.prior, way.sees_system) == wanted]
+        wanted = self.config.algorithm, self.config.sees_system, self.config.blind_actor
+        methods = [
+            name for name, way in all_methods().items() if (way.prior, way.sees_system, way.blind_actor) == wanted
+        ]
         if not methods:  # as for an algorithm that is new
             return
         method = None if methods[0] == DEFAULT else methods[0]

@@ -32,6 +32,7 @@ class NetworkEntry(Struct, forbid_unknown_fields=True):
     layer_norm: bool = False
     actor_layer_norm: bool = False
     activation: Literal["relu", "tanh", "silu", "elu"] = "relu"
+    blind: Annotated[int, Meta(ge=0, le=2**20)] = 0
 
 
 class VaryingEntry(Struct, forbid_unknown_fields=True):

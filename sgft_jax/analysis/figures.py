@@ -29,11 +29,11 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = 6
 _MORE = """
     #78b41e #5a0087 #4b3c00 #d2004b #b487ff #005a00 #ff9687 #780f00 #005ad2 #b40087 #c3b469 #5a1e4b #965a4b #966900
-    #ff78e1 #00c35a #4bc3c3 #0f4b2d #875aa5 #007878 #87003c #0000ff #a5ff00"""
+    #ff78e1 #00c35a #4bc3c3 #0f4b2d #875aa5 #007878 #87003c #0000ff #a5ff00 #ff00ff"""
 _METHODS = """
     guarded sgft-sac sac mbpo tdmpc2 sgft-mpc sysid recurrent sgft-relabel h2oplus rebrac darc iql rlpd sgft-tdmpc2 sgft
     pbrs pbrs-branch sac-online sac-reset frozen-critic sgft-tdmpc2-code sgft-parts h2o h2oplus-edac cql edac
-    posterior wsrl"""
+    posterior wsrl asymmetric"""
 COLOURS: dict[str, str] = dict(zip(_METHODS.split(), (*PALETTE, *_MORE.split()), strict=True))  # all far apart
 
 type Points = Mapping[str, tuple[np.ndarray, np.ndarray]]  # [n] V_sim and [n] returns, by where they are from

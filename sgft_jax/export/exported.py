@@ -195,6 +195,8 @@ def _system(params: Any, env: Env) -> np.ndarray:
 def _action(write: _Writer, params: PyTree, x: str, network: NetworkConfig, act_dim: int) -> str:
     """The mode of a tanh-Gaussian, or what a deterministic actor does."""
     activation = network.activation.capitalize()  # the operator's name
+    if network.blind:
+        x = write("Gather", x, np.arange(params["Dense_0"]["kernel"].shape[0]))
     for i in range(len(network.hidden)):
         x = _dense(write, params[f"Dense_{i}"], x)
         if network.actor_layer_norm:

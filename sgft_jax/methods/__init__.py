@@ -22,7 +22,7 @@ Kind = Literal["online", "fixed"]
 # Of tables and figures: the ones to try first stand first, what is not listed last.
 _ORDER = (
     *("guarded", "posterior", "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "sgft", "tdmpc2", "mbpo", "sysid"),
-    *("recurrent",),
+    *("recurrent", "asymmetric"),
     *("h2oplus", "h2oplus-edac", "h2o", "darc", "sac", "rlpd", "wsrl", "sac-online", "iql", "cql", "rebrac", "edac"),
     *("sac-reset", "pbrs", "pbrs-branch", "frozen-critic", "sgft-tdmpc2-code", "sgft-parts"),
 )
@@ -106,7 +106,7 @@ def _checked(source: str, method: Any, kind: Kind) -> Method:
 
 def _check_fields(way: Online | Fixed) -> None:
     words = {"family": get_args(Family), "prior": PRETRAINED, "kind": get_args(FixedKind)}
-    flags = ("needs_prior", "zero_shot", "sees_system", "by_data")
+    flags = ("needs_prior", "zero_shot", "sees_system", "blind_actor", "by_data")
     for field, value in way._asdict().items():
         if field in words and value not in words[field]:
             raise UserError(f"{field} is {value!r}; choose from {', '.join(words[field])}")

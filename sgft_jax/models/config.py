@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 from envs.types import UserError, unknown
 from sgft_jax import checks
@@ -24,6 +24,8 @@ class NetworkConfig(checks.Checked):
     actor_layer_norm: bool = False
     """The same in the actor."""
     activation: Activation = "relu"
+    blind: Annotated[int, checks.least(0), checks.few] = 0
+    """Entries at the end of the observation that SAC's actor does not see; pretraining's blind-actor sets it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -94,10 +94,11 @@ def ensemble(member: Network, members: int) -> Network:
 
 def make_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Network:
     """apply(params, obs [obs_dim]) -> [2, act_dim]: pre-tanh mean and clipped log standard deviation."""
-    body = make_mlp(obs_dim, 2 * act_dim, config, layer_norm=config.actor_layer_norm)
+    seen = obs_dim - config.blind
+    body = make_mlp(seen, 2 * act_dim, config, layer_norm=config.actor_layer_norm)
 
     def apply(params: PyTree, obs: Array) -> Array:
-        mean, log_std = jnp.split(body.apply(params, obs), 2)
+        mean, log_std = jnp.split(body.apply(params, obs[:seen]), 2)
         return jnp.stack([mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)])
 
     return Network(body.init, apply)

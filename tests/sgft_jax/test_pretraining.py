@@ -315,6 +315,8 @@ def test_memory_counts_what_is_kept_and_drawn():
         ({"lr": float("nan")}, "option lr is nan: must be a positive number"),
         ({"gru": 0}, "option gru is 0: must be at least 1"),
         ({"algorithm": "recurrent", "sees_system": True}, "sees-system is True: must be off for a prior of recurrent"),
+        ({"network": NetworkConfig(blind=2)}, "network.blind is 2: must be 0: blind-actor sets it"),
+        ({"blind_actor": True}, "blind-actor is True: must be off where sees-system is off"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(changes, words):
