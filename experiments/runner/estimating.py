@@ -67,7 +67,8 @@ def learned(
             for i in range(1, parts):
                 program = programs[-1 if i % _SECOND == 1 else 0]
                 taught.append(program(params[i % len(params)], jax.random.fold_in(key_play, i)))
-                jax.block_until_ready(taught[max(0, i - _SECOND)])  # two engines work beside each other
+                if program is programs[0]:  # beside it the second engine works on
+                    jax.block_until_ready(taught[i])
                 far((i + 1) / parts)
             seen = join(jax.device_get(taught))  # from two devices
         count = -(-updates // per_call)
