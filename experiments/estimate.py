@@ -1,7 +1,7 @@
 """Give priors an estimator: a network that says which systems may have made real rollouts, for method `posterior`.
 
 It learns in simulation alone: systems are drawn from what a real one may be, and the priors' policies play ten rollouts
-in each, on a GPU an eighth of them in MuJoCo's own engine. Priors that play one task share what is learned. Ten to
+in each, on a GPU one in 22 of them in MuJoCo's own engine. Priors that play one task share what is learned. Ten to
 twenty minutes on a GPU.
 """
 
@@ -26,6 +26,9 @@ class EstimateArgs:
     """Simulated systems to learn from, ten rollouts each."""
     updates: int = 2500
     """Updates for each number of rollouts that are read together: one, two, four and ten."""
+    start: Path | None = None
+    """Prior of the task whose estimator goes on learning, such as shipped:push/seed-0: the way without a GPU, with
+    --lessons 4000 --updates 100 in 36 minutes on two cores (docs/methods.md)."""
     task: str | None = None
     """A Python file with a task of your own; default: the task of the prior."""
     impl: Impl = "auto"
@@ -45,7 +48,7 @@ def main(args: EstimateArgs) -> None:
     import envs
     from envs.mujoco.worlds import choose_impl
     from experiments.runner.estimating import Simulator, learned
-    from sgft_jax.io.priors import load_priors, save_prior, variant_of
+    from sgft_jax.io.priors import load_prior, load_priors, save_prior, variant_of
     from sgft_jax.models.config import network_of
     from sgft_jax.policies import sac_policy
     from sgft_jax.posterior.candidates import candidates
@@ -55,13 +58,23 @@ def main(args: EstimateArgs) -> None:
     engines = dict.fromkeys((choose_impl(args.impl), "c"))
     made = [envs.make(task, engine, **variant_of(folders)) for engine in engines]
     env = made[0]
-    priors, entry = load_priors(folders, env, estimators=True), entry_of(env)
+    priors, entry = load_priors(folders, env), entry_of(env)
+    former = args.start and load_prior(args.start)
+    if former and former.card.get("estimator") != entry:
+        raise UserError(f"--start {args.start}: has no estimator of the systems of {env.name}")
     policy = sac_policy(env.obs_dim, env.act_dim, network_of(priors[0].card))
     with doing(f"compiling the simulator and worlds of {env.name}", 40, once=True):
         env.prepare()
         simulators = [Simulator(env, candidates(env)) for env in made]
     params = [prior.params for prior in priors]
-    estimator, gained = learned(simulators, policy, params, lessons=args.lessons, updates=args.updates)
+    estimator, gained = learned(
+        simulators,
+        policy,
+        params,
+        lessons=args.lessons,
+        updates=args.updates,
+        former=former and former.params.estimator,
+    )
     for folder, prior in zip(folders, priors, strict=True):
         card = {**prior.card, "estimator": entry}
         print(save_prior(folder, Prior(prior.params._replace(estimator=estimator), card)))

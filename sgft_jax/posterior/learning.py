@@ -81,8 +81,13 @@ def simulate(env: Env, systems: Candidates, policy: Policy, params: PyTree, key:
 
 def begin(key: Key, lessons: Lessons) -> Learning:
     """Before the first update."""
-    fresh = init(key, lessons.rollouts, lessons.points.shape[1])
-    return Learning(optim.start(_OPTIMISER, fresh.params), fresh._replace(params=()))
+    return resume(init(key, lessons.rollouts, lessons.points.shape[1]))
+
+
+def resume(estimator: Estimator) -> Learning:
+    """An estimator that goes on learning. What `finish` fitted starts anew."""
+    fresh = estimator._replace(params=(), ranks=jnp.zeros_like(estimator.ranks))
+    return Learning(optim.start(_OPTIMISER, estimator.params), fresh)
 
 
 def learn(learning: Learning, lessons: Lessons, key: Key, *, together: int, updates: int, total: int) -> Learning:

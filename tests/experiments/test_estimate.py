@@ -35,6 +35,12 @@ def test_a_prior_is_given_an_estimator_and_adapts(prior, tmp_path, monkeypatch, 
     assert jax.tree.all(same)
     learned, shipped = (jax.tree.leaves(prior.params.estimator) for prior in (after, before))
     assert any(not np.array_equal(*pair) for pair in zip(learned, shipped, strict=True))
+    ranks = np.asarray(after.params.estimator.ranks)
+    with jax.numpy_rank_promotion("allow"):
+        estimate.main(estimate.EstimateArgs(prior=prior, start=prior, lessons=2, updates=1, impl="c"))
+    again = load_prior(prior).params.estimator
+    moved = jax.tree.map(lambda a, b: np.abs(a - b).max(), after.params.estimator.params, again.params)
+    assert 0 < max(jax.tree.leaves(moved)) < 0.01 and not np.array_equal(ranks, again.ranks)
     options = ["--task", "push", "--method", "posterior", "--prior", str(prior), "--rollouts", "2", "--no-video"]
     finetune.main([*options, "--seeds", "1", "--eval-episodes", "2", "--impl", "c", "--out", str(tmp_path / "runs")])
     (summary,) = (tmp_path / "runs").rglob("summary.json")

@@ -170,6 +170,8 @@ ROWS = [
 ]
 
 HEAVY = [
+    ("estimate --prior prior --start nowhere", "nowhere: no such folder"),
+    ("estimate --prior prior --start shipped:hammer/seed-0", "has no estimator of the systems of push"),
     ("studies.guidance --actions 0", "--actions is 0: must be at least 1"),
     ("studies.guidance --real nope", "gap of push: there is no 'nope'"),
     ("studies.guidance --prior nowhere", "nowhere"),
