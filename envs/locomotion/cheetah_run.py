@@ -16,12 +16,12 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry
-from envs.control.suite import mass_parameters, masses_of, over_frames, weigh
+from envs.control.suite import runner
 from envs.locomotion import halfcheetah, planar
 from envs.locomotion.halfcheetah import ARMATURE, HEAD, HEIGHT, MASS, TORSO
 from envs.locomotion.planar import NV, Capsule
 from envs.mujoco.parts import add_pair
-from envs.mujoco.scene import Measured, Scene
+from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -52,14 +52,8 @@ LINKS = tuple(
 TRUNK: dict[str, Capsule] = {"torso": TORSO, "head": HEAD._replace(turn=np.radians(50))}
 
 
-def build(theta: dict[str, float]) -> mujoco.MjSpec:
-    """The scene for one theta."""
-    spec = _suite()
-    weigh(spec, _plain(), ALIKE, theta)
-    return spec
-
-
-def _suite() -> mujoco.MjSpec:
+def draw() -> mujoco.MjSpec:
+    """The suite's scene."""
     euler = mujoco.mjtIntegrator.mjINT_EULER
     spec, torso = planar.stage(timestep=FRAME, integrator=euler, gravity=1.0, height=HEIGHT, ref=0.0)
     volume = sum(capsule.volume for capsule in (*TRUNK.values(), *(link.capsule for link in LINKS)))
@@ -77,14 +71,9 @@ def _suite() -> mujoco.MjSpec:
 
 
 @functools.cache
-def _plain() -> mujoco.MjModel:
-    return _suite().compile()
-
-
-@functools.cache
 def _starts() -> tuple[np.ndarray, np.ndarray]:
     """Positions and speeds [starts, 9] that cheetahs with the suite's masses come to rest in, from random joints."""
-    model, rng, rows = _plain(), np.random.default_rng(0), []
+    model, rng, rows = draw().compile(), np.random.default_rng(0), []
     data, limited = mujoco.MjData(model), model.jnt_limited.astype(bool)
     for _ in range(_STARTS):
         mujoco.mj_resetData(model, data)
@@ -113,41 +102,25 @@ def frame_reward(masses: Array, obs: Array) -> Array:
     return jnp.clip((velocity[0] + drift) / SPEED, 0.0, 1.0)
 
 
-def _reward(masses: Array, obs: Array, next_obs: Array) -> Array:
-    return over_frames(functools.partial(frame_reward, masses), obs, next_obs, REPEAT)
-
-
-def reward(obs: Array, action: Array, next_obs: Array) -> Array:
-    """Sum over the frames of a step of a cheetah with the suite's masses."""
-    return _reward(jnp.asarray(_plain().body_mass[1:]), obs, next_obs)
-
-
-def measured(params: Array, before: PhysicsState, action: Array, after: PhysicsState) -> Measured:
-    """The reward of the cheetah as it is."""
-    masses = masses_of(_plain(), ALIKE, params)
-    return Measured(reward=_reward(masses, observe(params, before), observe(params, after)))
-
-
 def scene(name: str = "cheetah-run", **masses: Any) -> Scene:
-    """The task. masses: see `mass_parameters`."""
-    return Scene(
+    """The task. masses: see `envs.control.suite.runner`."""
+    return runner(
+        draw,
+        frame_reward,
+        frames=REPEAT,
+        observe=observe,
+        alike=ALIKE,
         name=name,
         observation=planar.OBSERVATION,
         action=(Entry("joint_torques", "gear", 6),),
-        parameters=mass_parameters(**masses),
         episode_length=250,
         control_dt=CONTROL_DT,
         substeps=REPEAT,
-        build=build,
         initial=initial,
         settled=planar.settled,
-        target=lambda qpos, action: jnp.clip(action, -1.0, 1.0),
-        observe=observe,
-        reward=reward,
-        measured=measured,
-        score="return",
         view=planar.VIEW,
         max_speed=1_000.0,
+        **masses,
     )
 
 

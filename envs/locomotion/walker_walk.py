@@ -5,7 +5,6 @@ any posture and never ends early. An action lasts two frames and earns the rewar
 The real walker has other masses, see `envs.control.suite`.
 """
 
-import functools
 from typing import Any
 
 import jax
@@ -14,10 +13,10 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry
-from envs.control.suite import bell, mass_parameters, masses_of, over_frames, weigh
+from envs.control.suite import bell, runner
 from envs.locomotion import planar
 from envs.locomotion.planar import NV, Capsule, Link
-from envs.mujoco.scene import Measured, Scene
+from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -50,14 +49,8 @@ LINKS = _leg("right") + _leg("left")
 LOWEST, HIGHEST = np.array([link.range for link in LINKS]).T  # rad
 
 
-def build(theta: dict[str, float]) -> mujoco.MjSpec:
-    """The scene for one theta."""
-    spec = _suite()
-    weigh(spec, _plain(), ALIKE, theta)
-    return spec
-
-
-def _suite() -> mujoco.MjSpec:
+def draw() -> mujoco.MjSpec:
+    """The suite's scene."""
     euler = mujoco.mjtIntegrator.mjINT_EULER
     spec, torso = planar.stage(timestep=TIMESTEP, integrator=euler, gravity=1.0, height=HEIGHT, ref=HEIGHT)
     geom: dict[str, Any] = {"density": DENSITY, "friction": FRICTION}
@@ -65,11 +58,6 @@ def _suite() -> mujoco.MjSpec:
     for link in LINKS:
         planar.add_link(spec, link, axis=-1, armature=ARMATURE, geom=geom, limit=LIMIT)
     return spec
-
-
-@functools.cache
-def _plain() -> mujoco.MjModel:
-    return _suite().compile()
 
 
 def initial(params: Array, key: Key) -> PhysicsState:
@@ -106,24 +94,14 @@ def frame_reward(masses: Array, obs: Array) -> Array:
     return standing * (5 * jnp.clip((velocity[0] + drift) / SPEED, 0.0, 1.0) + 1) / 6
 
 
-def _reward(masses: Array, obs: Array, next_obs: Array) -> Array:
-    return over_frames(functools.partial(frame_reward, masses), obs, next_obs, REPEAT)
-
-
-def reward(obs: Array, action: Array, next_obs: Array) -> Array:
-    """Sum over the frames of a step of a walker with the suite's masses."""
-    return _reward(jnp.asarray(_plain().body_mass[1:]), obs, next_obs)
-
-
-def measured(params: Array, before: PhysicsState, action: Array, after: PhysicsState) -> Measured:
-    """The reward of the walker as it is."""
-    masses = masses_of(_plain(), ALIKE, params)
-    return Measured(reward=_reward(masses, observe(params, before), observe(params, after)))
-
-
 def scene(name: str = "walker-walk", **masses: Any) -> Scene:
-    """The task. masses: see `mass_parameters`."""
-    return Scene(
+    """The task. masses: see `envs.control.suite.runner`."""
+    return runner(
+        draw,
+        frame_reward,
+        frames=REPEAT,
+        observe=observe,
+        alike=ALIKE,
         name=name,
         observation=(
             Entry("pitches", "", 2 * LINKED),
@@ -133,20 +111,14 @@ def scene(name: str = "walker-walk", **masses: Any) -> Scene:
             Entry("joint_velocities", "rad/s", 6),
         ),
         action=(Entry("joint_torques", "gear", 6),),
-        parameters=mass_parameters(**masses),
         episode_length=500,
         control_dt=CONTROL_DT,
         substeps=round(CONTROL_DT / TIMESTEP),
-        build=build,
         initial=initial,
         settled=settled,
-        target=lambda qpos, action: jnp.clip(action, -1.0, 1.0),
-        observe=observe,
-        reward=reward,
-        measured=measured,
-        score="return",
         view=planar.VIEW,
         max_speed=1_000.0,
+        **masses,
     )
 
 

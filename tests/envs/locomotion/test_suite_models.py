@@ -57,7 +57,7 @@ def seen(name, observation):
 @pytest.mark.filterwarnings("ignore")
 def test_moves_looks_and_pays_like_dm_control(name):
     task, theirs = TASKS[name], oracle(name)
-    model = task.build(PLAIN).compile()
+    model = task.SCENE.build(PLAIN).compile()
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     np.testing.assert_allclose(model.body_mass, theirs.physics.model.body_mass, rtol=1e-6)
     np.testing.assert_allclose(model.dof_armature, theirs.physics.model.dof_armature[ORDER[name]])
@@ -83,7 +83,7 @@ def test_moves_looks_and_pays_like_dm_control(name):
 @pytest.mark.filterwarnings("ignore")
 def test_the_same_links_touch(name):
     """In any posture, also links that touch each other."""
-    theirs, model = oracle(name).physics, TASKS[name].build(PLAIN).compile()
+    theirs, model = oracle(name).physics, TASKS[name].SCENE.build(PLAIN).compile()
     data, rng, each_other = mujoco.MjData(model), np.random.default_rng(0), 0
     for _ in range(300):
         with theirs.reset_context():
@@ -100,11 +100,11 @@ def test_the_same_links_touch(name):
 def test_a_step_pays_for_all_of_its_frames(name):
     """Straight from one end of a step to the other: 2 % of an episode's reward at most."""
     task = TASKS[name]
-    model = task.build(PLAIN).compile()
+    model = task.SCENE.build(PLAIN).compile()
     data, rng, masses = mujoco.MjData(model), np.random.default_rng(0), jnp.asarray(model.body_mass[1:])
     start = task.initial(jnp.zeros(2), jax.random.key(0))
     data.qpos[:], data.qvel[:] = start.qpos, start.qvel
-    step = jax.jit(task.reward)
+    step = jax.jit(task.SCENE.reward)
     frame = jax.jit(lambda state: task.frame_reward(masses, task.observe(jnp.zeros(2), state)))
     total, exact = 0.0, 0.0
     for i in range(STEPS):
@@ -133,7 +133,7 @@ def test_masses_are_those_of_du_et_al(name):
 
 
 def test_doubled_masses_keep_their_inertias(name):
-    plain, heavy = (TASKS[name].build(PLAIN | {"mass": mass}).compile() for mass in (1.0, 2.0))
+    plain, heavy = (TASKS[name].SCENE.build(PLAIN | {"mass": mass}).compile() for mass in (1.0, 2.0))
     np.testing.assert_allclose(heavy.body_mass, 2 * plain.body_mass, rtol=1e-6)
     np.testing.assert_allclose(heavy.body_inertia, plain.body_inertia)
     assert find(TASKS[name].SCENE.name, "x2").params == {"mass": 2}
@@ -142,14 +142,14 @@ def test_doubled_masses_keep_their_inertias(name):
 def test_speed_is_that_of_the_walker_as_it_is(name):
     """The centre of mass of links that all weigh the same, which MuJoCo knows."""
     task, theta = TASKS[name], {"mass": 1.5, "even": 1.0}
-    model = task.build(theta).compile()
+    model = task.SCENE.build(theta).compile()
     data, rng = mujoco.MjData(model), np.random.default_rng(1)
     data.qpos[:] = rng.uniform(-1, 1, 9)
     data.qpos[1], data.qvel[:] = 1.5, rng.normal(size=9)
     data.qvel[0] = 1.0
     mujoco.mj_forward(model, data)
     mujoco.mj_subtreeVel(model, data)
-    masses = suite.masses_of(task.build(PLAIN).compile(), task.ALIKE, jnp.array([1.5, 1.0]))
+    masses = suite.masses_of(task.SCENE.build(PLAIN).compile(), task.ALIKE, jnp.array([1.5, 1.0]))
     state, speed = state_of(data), float(data.subtree_linvel[1][0])
     assert 0.1 < speed < task.SPEED
     paid = float(task.frame_reward(masses, task.observe(jnp.zeros(2), state)))
