@@ -107,7 +107,8 @@ def main(args: FrozenArgs) -> None:
 
 def units(args: FrozenArgs) -> Iterator[Unit]:
     """All units, in the order in which they are begun."""
-    for preset in dict.fromkeys(preset_of(get_method(method)) for method in EVERYWHERE):
+    others = [name for name in NAMES if name not in (*EVERYWHERE, *LEFT_OUT)]
+    for preset in dict.fromkeys(preset_of(get_method(method)) for method in (*EVERYWHERE, *others)):
         for task in (*TASKS, *(SOFT if preset == DEFAULT_PRESET else ())):
             yield from _prior_units(args, task, preset)
     for method, task in product(EVERYWHERE, TASKS):
@@ -116,7 +117,7 @@ def units(args: FrozenArgs) -> Iterator[Unit]:
         yield from _run_units(args, task, DEFAULT, (SIM, _test_file(task)), again=True)
     for method, task in product(ON_SOFT, SOFT):
         yield from _run_units(args, task, method, ("default",), few=True)
-    for method, task in product((name for name in NAMES if name not in (*EVERYWHERE, *LEFT_OUT)), TASKS):
+    for method, task in product(others, TASKS):
         yield from _run_units(args, task, method, two_gaps(task), few=True)
 
 
