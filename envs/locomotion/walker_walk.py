@@ -33,9 +33,9 @@ LINKED = 7  # the torso and six links
 
 
 def _leg(side: str) -> tuple[Link, ...]:
-    """side: what begins the names of a leg. Both legs are in one plane."""
+    """side: what ends the names of a leg. Both legs are in one plane."""
     hip, knee, ankle = (tuple(np.radians(limits)) for limits in ((-20.0, 100.0), (-150.0, 0.0), (-45.0, 45.0)))
-    thigh, leg, foot = (f"{side}_{part}" for part in ("thigh", "leg", "foot"))
+    thigh, leg, foot = (f"{part}{side}" for part in ("thigh", "leg", "foot"))
     joint = (0.0, DAMPING)  # no spring
     sole = Capsule(0.05, 0.1, (0.0, 0.0), np.pi / 2)
     return (
@@ -45,7 +45,7 @@ def _leg(side: str) -> tuple[Link, ...]:
     )
 
 
-LINKS = _leg("right") + _leg("left")
+LINKS = _leg("") + _leg("_left")
 LOWEST, HIGHEST = np.array([link.range for link in LINKS]).T  # rad
 
 

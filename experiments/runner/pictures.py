@@ -45,13 +45,20 @@ def before_and_after(env: Env, pool: World, play: Callable[[], Sequence[Episode]
         first = telling(*(np.asarray(episodes.success) for episodes in both))
         both = [jax.tree.map(lambda x: np.asarray(x[first]), episodes) for episodes in both]
         captions = [
-            f"{name}: {'success' if episode.success else 'failure'}"
+            f"{name}: {outcome(env, episode.success, episode.total_reward)}"
             for name, episode in zip(("before fine-tuning", f"after {rollouts} real rollouts"), both, strict=True)
         ]
         theta = np.asarray(pool.theta.params[both[0].world]).tolist()
         render_side_by_side(scene, [theta, theta], [episode.trace for episode in both], captions, path)
 
     return _draw(env, path, render)
+
+
+def outcome(env: Env, success: Any, earned: Any) -> str:
+    """How an episode ended, in words of what the task is judged by. earned: the sum of its rewards."""
+    if env.score == "return":
+        return f"return {float(earned):.3g}"
+    return "success" if success else "failure"
 
 
 def telling(before: np.ndarray, after: np.ndarray) -> int:
@@ -134,7 +141,7 @@ def draw(home: Path, task: str, episodes: Sequence[Played], out: Path, *, video:
     seed, numbers = episodes[0].seed, [str(episode.number) for episode in episodes]
     path = out / f"seed-{seed}-rollout-{'-'.join(numbers)}.png"
     ends = np.cumsum([len(episode.rows.reward) for episode in episodes]) * env.control_dt
-    words = [f"rollout {e.number}: {'success' if e.success else 'failure'}" for e in episodes]
+    words = [f"rollout {e.number}: {outcome(env, e.success, np.sum(e.rows.reward))}" for e in episodes]
     words, title = numbers if len(episodes) > _WORDY else words, f"{env.name}: real rollouts of seed {seed}"
     figures.rollouts(path, panels(env, episodes), dict(zip(words, ends.tolist(), strict=True)), title=title)
     return [f"picture: {path}", *(_video(home, task, episode, out) for episode in episodes if video)]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import toy
 from priors_by_hand import save_prior
 
 from envs.types import UserError
@@ -96,6 +97,13 @@ def test_the_film_shows_an_episode_that_was_mended():
     no, yes = False, True
     assert pictures.telling(np.array([yes, no, no]), np.array([yes, no, yes])) == 2
     assert pictures.telling(np.array([yes, no]), np.array([yes, no])) == 0
+
+
+def test_an_episode_is_described_by_what_its_task_is_judged_by():
+    by_success, by_return = (toy.make()._replace(score=score) for score in ("success", "return"))
+    assert pictures.outcome(by_success, np.bool_(True), 3.0) == "success"
+    assert pictures.outcome(by_success, np.bool_(False), 3.0) == "failure"
+    assert pictures.outcome(by_return, np.bool_(False), np.float32(123.4)) == "return 123"
 
 
 def test_the_first_and_the_last_evaluation_are_filmed():

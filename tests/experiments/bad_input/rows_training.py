@@ -1,7 +1,10 @@
 """What pretraining, fine-tuning, hybrid runs and the demo cannot use."""
 
 ROWS = [
-    ("pretrain --preset fsat", "--preset: there is no 'fsat', did you mean 'fast'? Choose from: asymmetric, cpu, fast,"),
+    (
+        "pretrain --preset fsat",
+        "--preset: there is no 'fsat', did you mean 'fast'? Choose from: asymmetric, cpu, fast,",
+    ),
     ("pretrain --seed -1", "--seed is -1: seeds go from 0 to 2147483647"),
     ("pretrain --seed 99999999999999999999", "--seed is 99999999999999999999: seeds go from 0 to 2147483647"),
     ("pretrain --seeds 99999999999", "--seeds is 99999999999: must be at most 65536"),
