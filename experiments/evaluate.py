@@ -77,10 +77,9 @@ def main(args: EvaluateArgs) -> None:
         for one in system["policies"]:
             low, high = (100 * x for x in one["success/interval"])
             exploded = f", {100 * one['exploded']:.1f} % exploded" if one["exploded"] else ""
-            print(
-                f"  {one['policy']}: success {100 * one['success']:.1f} % [{low:.1f}, {high:.1f}], "
-                f"return {one['return']:.3f}{exploded}"
-            )
+            success = f"success {100 * one['success']:.1f} % [{low:.1f}, {high:.1f}], "
+            success *= results["score"] == "success"
+            print(f"  {one['policy']}: {success}return {one['return']:.3f}{exploded}")
             if "video" in one:
                 print(f"    {one['video']}")
         if "next" in system:
@@ -158,7 +157,7 @@ def _evaluate(args: EvaluateArgs, folders: list[Path], task: str) -> dict[str, A
             succeeded = part(played, i, len(priors)).success
             facts["next"] = advice(int((~succeeded).sum()), succeeded.size, args.real[i], **chosen)
         systems.append(facts)
-    return {"task": env.name, "impl": env.impl, "episodes": args.episodes, "systems": systems}
+    return {"task": env.name, "score": env.score, "impl": env.impl, "episodes": args.episodes, "systems": systems}
 
 
 def check(args: EvaluateArgs) -> tuple[list[Path], str]:

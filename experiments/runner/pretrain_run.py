@@ -278,7 +278,8 @@ class _Run(Training):
     def log(self, state: FleetState, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
         super().log(state, values, seconds)
         ended = values["train/episodes"].all()  # episodes begin together, so in some chunks none ends
-        return {"success, exploring": float(values["train/success"].mean())} if ended else {}
+        name = "success" if self.env.score == "success" else "reward"
+        return {f"{name}, exploring": float(values[f"train/{name}"].mean())} if ended else {}
 
     def evaluate(self, state: FleetState, done: int) -> dict[str, float]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
@@ -289,7 +290,7 @@ class _Run(Training):
         self.record.log.eval(done, values)
         since = self.config.choose_from * self.config.chunks * self.config.chunk_steps
         self.best = best_of(self.best, params, played, state.rounds, since=since)
-        return {f"{name}, evaluation": float(values[name].mean()) for name in ("success", "return")}
+        return {f"{name}, evaluation": float(values[name].mean()) for name in dict.fromkeys((self.env.score, "return"))}
 
     def checkpoint(self, state: FleetState, done: int) -> None:
         assert self.best is not None  # evaluated before the first chunk
