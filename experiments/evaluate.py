@@ -78,8 +78,8 @@ def main(args: EvaluateArgs) -> None:
             low, high = (100 * x for x in one["success/interval"])
             exploded = f", {100 * one['exploded']:.1f} % exploded" if one["exploded"] else ""
             success = f"success {100 * one['success']:.1f} % [{low:.1f}, {high:.1f}], "
-            success *= results["score"] == "success"
-            print(f"  {one['policy']}: {success}return {one['return']:.3f}{exploded}")
+            judged = success if results["score"] == "success" else ""
+            print(f"  {one['policy']}: {judged}return {one['return']:.3f}{exploded}")
             if "video" in one:
                 print(f"    {one['video']}")
         if "next" in system:

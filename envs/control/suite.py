@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Parameter
+from envs.base import Entry, Parameter
 from envs.mujoco.scene import Measured, Scene
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array
@@ -33,7 +33,7 @@ def runner(
     even: float = 0.0,
     **parts: Any,
 ) -> Scene:
-    """A scene of links whose masses vary, paid for every frame of a step.
+    """A scene of links on six motors whose masses vary, paid for every frame of a step.
 
     draw() -> the suite's own. frame_reward(masses [links], obs) -> []. frames: of a step. alike, even: see `masses_of`;
     even is fixed. mass: nominal, least and greatest factor in training. parts: see `Scene`.
@@ -58,6 +58,7 @@ def runner(
         return Measured(reward=paid(masses, observe(params, before), observe(params, after)))
 
     return Scene(
+        action=(Entry("joint_torques", "gear", 6),),
         parameters=(
             Parameter("mass", "", *mass, minimum=0.05, maximum=20.0),
             Parameter("even", "", even, even, even, minimum=0.0, maximum=1.0),
@@ -68,6 +69,7 @@ def runner(
         reward=lambda obs, action, next_obs: paid(jnp.asarray(plain().body_mass[1:]), obs, next_obs),
         measured=measured,
         score="return",
+        max_speed=1_000.0,
         **parts,
     )
 

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry
 from envs.control.suite import runner
 from envs.locomotion import halfcheetah, planar
 from envs.locomotion.halfcheetah import ARMATURE, HEAD, HEIGHT, MASS, TORSO
@@ -80,7 +79,8 @@ def _starts() -> tuple[np.ndarray, np.ndarray]:
         data.qpos[limited] = rng.uniform(*model.jnt_range[limited].T)
         mujoco.mj_step(model, data, REST)
         rows.append(np.stack([data.qpos, data.qvel]))
-    return np.stack(rows, axis=1)[0], np.stack(rows, axis=1)[1]
+    positions, speeds = np.stack(rows, axis=1)
+    return positions, speeds
 
 
 def initial(params: Array, key: Key) -> PhysicsState:
@@ -96,10 +96,8 @@ def observe(params: Array, state: PhysicsState) -> Array:
 
 def frame_reward(masses: Array, obs: Array) -> Array:
     """[] from 0 to 1: the whole moves ahead. masses: [7] kg."""
-    pose, velocity = obs[1 : NV - 1], obs[NV - 1 :]
-    trunk = tuple(TRUNK.values())
-    _, drift = jax.jvp(lambda pose: planar.lead(trunk, LINKS, 1, masses, pose), (pose,), (velocity[2:],))
-    return jnp.clip((velocity[0] + drift) / SPEED, 0.0, 1.0)
+    speed = planar.speed(tuple(TRUNK.values()), LINKS, 1, masses, obs[1 : NV - 1], obs[NV - 1 :])
+    return jnp.clip(speed / SPEED, 0.0, 1.0)
 
 
 def scene(name: str = "cheetah-run", **masses: Any) -> Scene:
@@ -112,14 +110,12 @@ def scene(name: str = "cheetah-run", **masses: Any) -> Scene:
         alike=ALIKE,
         name=name,
         observation=planar.OBSERVATION,
-        action=(Entry("joint_torques", "gear", 6),),
         episode_length=250,
         control_dt=CONTROL_DT,
         substeps=REPEAT,
         initial=initial,
         settled=planar.settled,
         view=planar.VIEW,
-        max_speed=1_000.0,
         **masses,
     )
 

@@ -1,7 +1,7 @@
 """What the planar runners share: links on hinges over a floor, the observation, the reward for running along x.
 
-They are the `-v2` systems of OpenAI Gym that D4RL was recorded on. A domain parameter multiplies what that system has,
-so all are 1 there.
+Those of `scene` are the `-v2` systems of OpenAI Gym that D4RL was recorded on. A domain parameter multiplies what that
+system has, so all are 1 there.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -149,8 +149,8 @@ def pitches(links: Sequence[Link], axis: float, pose: Array) -> Array:
 
 def joints(links: Sequence[Link], axis: float, turns: Array) -> Array:
     """The pose [1 + links] of these `pitches`, joints between -pi and pi."""
-    by_name = dict(zip(("torso", *(link.name for link in links)), turns, strict=True))
-    angles = jnp.stack([axis * (by_name[link.name] - by_name[link.parent]) for link in links])
+    named = _named(links, turns)
+    angles = jnp.stack([axis * (named[link.name] - named[link.parent]) for link in links])
     return jnp.concatenate([turns[:1], jnp.mod(angles + jnp.pi, 2 * jnp.pi) - jnp.pi])
 
 
@@ -160,7 +160,7 @@ def lead(trunk: Sequence[Capsule], links: Sequence[Link], axis: float, masses: A
     trunk: capsules of the torso, all of one density. axis: of the hinges, see `add_link`. masses: [1 + links], in any
     unit, the torso's first. pose: see `pitches`.
     """
-    turns = dict(zip(("torso", *(link.name for link in links)), pitches(links, axis, pose), strict=True))
+    turns = _named(links, pitches(links, axis, pose))
     volumes = [capsule.volume for capsule in trunk]
     middle = np.average([capsule.center for capsule in trunk], axis=0, weights=volumes)
     origins = {"torso": jnp.zeros(2)}
@@ -172,6 +172,19 @@ def lead(trunk: Sequence[Capsule], links: Sequence[Link], axis: float, masses: A
         origins[link.name] = origin
         centers.append((origin + _turned(link.capsule.center, turn))[0])
     return jnp.sum(masses * jnp.stack(centers)) / jnp.sum(masses)
+
+
+def speed(
+    trunk: Sequence[Capsule], links: Sequence[Link], axis: float, masses: Array, pose: Array, velocity: Array
+) -> Array:
+    """[] m/s of the centre of mass along x. velocity: of the root along x and z, then of the pose. See `lead`."""
+    _, drift = jax.jvp(lambda pose: lead(trunk, links, axis, masses, pose), (pose,), (velocity[2:],))
+    return velocity[0] + drift
+
+
+def _named(links: Sequence[Link], turns: Array) -> dict[str, Array]:
+    """Turns [1 + links] by the names of torso and links."""
+    return dict(zip(("torso", *(link.name for link in links)), turns, strict=True))
 
 
 def _turned(point: ArrayLike, angle: Array) -> Array:

@@ -15,7 +15,7 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.rollout import play_episode, real_env, real_worlds
-from envs.types import Array, Key, PyTree, UserError
+from envs.types import Array, Key, Policy, PyTree, UserError
 from experiments.runner import cli
 from experiments.runner.options import Impl, Out, at_least_one, seed_list
 from experiments.runner.progress import doing
@@ -64,28 +64,27 @@ def main(args: LandscapeArgs) -> None:
     check_prior(prior, get_method("sgft-sac"), env)  # it has a V_sim and models
     if {"hand_xy", "puck_xy"} - {entry.name for entry in env.observation}:
         raise UserError(f"--prior {args.prior}: is of {env.name}; this figure shows a hand that pushes a puck")
-    real = gaps.load(env, args.real)
+    policy, real = make_policy(prior.card, env), gaps.load(env, args.real)
     env = real_env(env, [real])
     key_play, key_imagine = jax.random.split(jax.random.key(args.seed))
     with doing(f"playing an episode of {env.name}", 30, once=True):
         pool = jax.tree.map(lambda x: x[0], real_worlds(env, [real], jax.random.key(0), 1))
-        path = _path(env, prior, pool, key_play)
-    imagined = _imagined(env, prior, path, key_imagine, args.branches, args.horizon)
+        path = _path(env, policy, prior.params, pool, key_play)
+    imagined = _imagined(env, policy, prior, path, key_imagine, args.branches, args.horizon)
     shown = np.concatenate([path[:, :2], path[:1, 2:4], imagined])
     ends = zip(shown.min(axis=0) - _MARGIN, shown.max(axis=0) + _MARGIN, strict=True)
     x, y = (np.linspace(low, high, _GRID) for low, high in ends)
-    values = _values(env, prior, path[0], x, y)
+    values = _values(policy, prior.params, path[0], x, y)
     title = f"V_sim of {env.name} by where the hand is, while the puck rests"
     drawn = {"rollout": path[:, :2], "imagined": imagined, "puck": path[:1, 2:4]}
     print(figures.landscape(folder / f"{env.name}.png", x, y, values, drawn, title=title))
 
 
-def _path(env: Env, prior: Prior, pool: World, key: Key) -> np.ndarray:
+def _path(env: Env, policy: Policy, params: PyTree, pool: World, key: Key) -> np.ndarray:
     """[n, obs_dim] states of an episode until the puck moves."""
-    policy = make_policy(prior.card, env)
 
     def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
-        return policy.act(prior.params, carry, obs, key, explore=False)
+        return policy.act(params, carry, obs, key, explore=False)
 
     episode = jax.jit(lambda key: play_episode(env, pool, act, policy.init_carry(), key, gamma=1.0))(key)
     obs = np.asarray(episode.transitions.obs)[np.asarray(episode.valid)]
@@ -93,10 +92,11 @@ def _path(env: Env, prior: Prior, pool: World, key: Key) -> np.ndarray:
     return obs[: int(np.argmax(moved)) if moved.any() else len(obs)]
 
 
-def _imagined(env: Env, prior: Prior, path: np.ndarray, key: Key, branches: int, horizon: int) -> np.ndarray:
+def _imagined(
+    env: Env, policy: Policy, prior: Prior, path: np.ndarray, key: Key, branches: int, horizon: int
+) -> np.ndarray:
     """[k, 2] where the hand is in imagined states."""
-    policy, params = make_policy(prior.card, env), prior.params
-    model = make_dynamics(env.obs_dim, env.act_dim, network_of(prior.card))
+    model, params = make_dynamics(env.obs_dim, env.act_dim, network_of(prior.card)), prior.params
 
     def branch(obs: Array, key: Key) -> Array:
         def step(obs: Array, key: Key) -> tuple[Array, Array]:
@@ -114,13 +114,13 @@ def _imagined(env: Env, prior: Prior, path: np.ndarray, key: Key, branches: int,
     return np.asarray(jax.jit(jax.vmap(of_state))(jnp.asarray(path), keys)).reshape(-1, 2)
 
 
-def _values(env: Env, prior: Prior, start: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _values(policy: Policy, params: PyTree, start: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """[y, x] V_sim with the hand there and all else as at the start."""
-    v_sim = make_policy(prior.card, env).value
+    v_sim = policy.value
     assert v_sim is not None  # as `main` has asked
 
     def value(x: Array, y: Array) -> Array:
-        return v_sim(prior.params, jnp.asarray(start).at[:2].set(jnp.stack([x, y])))
+        return v_sim(params, jnp.asarray(start).at[:2].set(jnp.stack([x, y])))
 
     return np.asarray(jax.jit(jax.vmap(jax.vmap(value, (0, None)), (None, 0)))(jnp.asarray(x), jnp.asarray(y)))
 

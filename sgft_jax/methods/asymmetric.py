@@ -4,20 +4,8 @@ Nothing learns from real rollouts. Source: Pinto et al. 2018, with SAC and domai
 V_sim has inputs that no robot measures.
 """
 
-from dataclasses import dataclass
-
-from sgft_jax import checks
-from sgft_jax.methods.recurrent import build
+from sgft_jax.methods.recurrent import Config, build
 from sgft_jax.types import Method, Online
-
-
-@dataclass(frozen=True)
-class Config(checks.Checked):
-    """Options of `asymmetric`."""
-
-    initial_rollouts: checks.Count = 1
-    """Real rollouts before the first learning phase; the policy does not learn, so results do not depend on it."""
-
 
 _ABOUT = "zero-shot: a policy whose critic was told the system"
 METHOD = Method(

@@ -12,7 +12,7 @@ from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 @dataclass(frozen=True)
 class Config(checks.Checked):
-    """Options of `recurrent`."""
+    """Options of methods in which nothing learns."""
 
     initial_rollouts: checks.Count = 1
     """Real rollouts before the first learning phase; the policy does not learn, so results do not depend on it."""

@@ -138,10 +138,8 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         agent = inner.observe(state.agent, rows, valid, score)
         if score is None:  # none of the policies has played
             return state._replace(agent=agent)
-        trust, known = (
-            update(state.trust, state.challenger, state.agent.interface.promised, score > 0.5),
-            agent.interface,
-        )
+        trust = update(state.trust, state.challenger, state.agent.interface.promised, score > 0.5)
+        known = agent.interface
         which = (rule(trust, known.promised, known.contradicted) for rule in (challenger, incumbent))
         return Deployed(agent, state.first, trust, *which)
 
