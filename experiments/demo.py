@@ -3,6 +3,7 @@
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from experiments.finetune import finetune
 from experiments.runner import cli
@@ -12,6 +13,9 @@ from experiments.runner.progress import doing
 from sgft_jax.io.log import EVAL, METRICS, read_jsonl
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
+
+if TYPE_CHECKING:
+    from experiments.runner.narrowed import Narrowed
 
 _METHOD = "posterior"
 _GAP = Path(__file__).parents[1] / "envs/gaps/development/push-drawn.toml"
@@ -41,21 +45,15 @@ def main(args: DemoArgs) -> None:
     """Plays, says after every rollout which systems may have made them, and how what is chosen does."""
     run, started = plan(args), time.monotonic()
     finetune(run)
-    from experiments.runner.narrowed import narrowed
+    from experiments.runner.narrowed import table
     from sgft_jax.analysis import figures, tables
 
     home = run_folder(run, args.real)
     with doing("drawing from the posterior", 10, once=True):
-        unknowns = narrowed(run, home)
-    path = figures.shrinking(home / "figures" / "posterior.png", *unknowns, title="Which system is it?")
-    names, truth, intervals = unknowns
-    after = [f"{n} rollout{'s' * (n != 1)}" for n in range(len(intervals))]
-    rows = [
-        [name, *(f"{low:.3g} to {high:.3g}" for low, high in intervals[:, i]), f"{truth[i]:.3g}"]
-        for i, name in enumerate(names)
-    ]
+        known, counts = narrowed_by(run, home)
+    path = figures.shrinking(home / "figures" / "posterior.png", *known, counts, title="Which system is it?")
     print("\nWhich system is it? 80 % intervals of what rollouts tell most of:\n")
-    print(tables.markdown(["", *after, "true"], rows))
+    print(table(known, counts))
     print("\nSuccess without exploration, before it promised by simulation:\n")
     print(tables.markdown(["rollouts", "deployed", "promised", "succeeds", "plays the next rollout"], outcome(home)))
     print(f"\nfigure: {path}\nother kinds of gap: docs/results.md")
@@ -74,6 +72,22 @@ def plan(args: DemoArgs) -> FinetuneArgs:
     priors_of(run)
     check(run)
     return run
+
+
+def narrowed_by(run: FinetuneArgs, home: Path) -> tuple["Narrowed", list[int]]:
+    """What the rollouts of a run of `posterior` tell of its real system, after so many of them."""
+    import jax
+
+    from envs import gaps
+    from experiments.runner.diagnose_run import load, recorded_in
+    from experiments.runner.narrowed import narrowed, posterior
+    from sgft_jax.posterior.estimator import MOST
+
+    env, priors = load(run.task, run.impl, priors_of(run))
+    seen, key = recorded_in(env, priors, home, None), jax.random.key(run.seed)
+    counts = list(range(min(len(seen.real[0].success), MOST) + 1))
+    points = posterior(env, priors[seen.which[0]], seen.real[0], counts, key)
+    return narrowed(env, points, gaps.load(env, run.real[0])), counts
 
 
 def outcome(home: Path) -> list[list[str]]:

@@ -1,7 +1,4 @@
-"""Say from a few real rollouts what kind of gap this is, whether fine-tuning will help, and how soon.
-
-Draws four panels, writes the numbers as JSON, and prints a verdict in words (docs/diagnose.md).
-"""
+"""Say from a few real rollouts which system this is, and what simulation promises of corrections (docs/diagnose.md)."""
 
 import json
 from dataclasses import dataclass
@@ -30,7 +27,8 @@ class DiagnoseArgs:
     remote[:HOST[:PORT]], a robot (docs/real-robot.md). Or what was recorded: a folder of a fine-tuning run, or any
     other with rollouts in real/ (docs/formats.md)."""
     rollouts: int | None = None
-    """Only the first so many recorded rollouts; default: all. On a gap: how many to play, default 4."""
+    """Only the first so many recorded rollouts; default: all, of which ten tell the system. On a gap: how many to play,
+    default 4."""
     json: Json = False
     out: Path = Path("runs")
     """Parent of all run folders; picture and numbers go to <out>/diagnose/<task>/<name>."""

@@ -18,7 +18,6 @@ COMMANDS = (
     "gaps",
     "studies.tune",
     "studies.gaps_draw",
-    "studies.diagnose_calibrate",
     "benchmark",
     "tasks",
     "diagnose",

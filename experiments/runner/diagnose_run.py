@@ -1,8 +1,9 @@
 """Impure: a diagnosis of one real system by every prior. `experiments.diagnose` is its command."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,174 +12,194 @@ import numpy as np
 import envs
 from envs import gaps
 from envs.base import Env
-from envs.gaps import SIM, Gap
+from envs.gaps import Gap
 from envs.rollout import Episode
 from envs.types import Transition, UserError
 from experiments.runner.cli import columns
 from experiments.runner.gaps_run import systems
+from experiments.runner.narrowed import narrowed, posterior, readable, table
 from experiments.runner.progress import doing
 from experiments.runner.real_systems import REMOTE, advice, connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
 from experiments.runner.training import play
 from sgft_jax import api, stacking
 from sgft_jax.algorithms import make_policy
-from sgft_jax.analysis import figures, tables, verdict
+from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.reading import last_start
-from sgft_jax.analysis.verdict import Names
-from sgft_jax.diagnosis import Rollouts
-from sgft_jax.examination import Examined, Examiner
+from sgft_jax.diagnosis import Rollouts, honesty, promises
 from sgft_jax.files.disk import jsonable, write_json
 from sgft_jax.io.priors import digest, load_priors, variant_of
 from sgft_jax.io.real import RealStore
 from sgft_jax.io.runs import read_config
 from sgft_jax.math import stats
 from sgft_jax.methods import get_method
-from sgft_jax.models.distortion import FURTHEST
+from sgft_jax.posterior.candidates import candidates
+from sgft_jax.posterior.estimator import MOST, without_estimator
+from sgft_jax.posterior.interface import MAKE, Inference, check_estimator, infer
+from sgft_jax.posterior.trust import AS_IS, CORRECTED
 from sgft_jax.types import Prior
 
 if TYPE_CHECKING:
     from experiments.diagnose import DiagnoseArgs
 
-SIMULATED, PLAYED = 32, 4  # rollouts of every prior in simulation, and on a gap unless the user says otherwise
+_PLAYED = 4  # rollouts of every prior on a gap, unless the user says otherwise
 _SEED = 2**31 + 7  # of all of them
 _READ = (*Transition._fields, "valid", "success")  # arrays of a recorded rollout
+
+
+class Evidence(NamedTuple):
+    """Rollouts [n] of every member, and which prior looks at each. name: of the folder. words: what was played where.
+    gap: the real system, where one knows.
+    """
+
+    real: list[Rollouts]
+    which: list[int]
+    name: str
+    words: str
+    gap: Gap | None = None
+
+
+class Inferred(NamedTuple):
+    """points: [counts, draws, d] of the posteriors of all members after so many rollouts. inference: [M] after all."""
+
+    counts: list[int]
+    points: np.ndarray
+    inference: Inference
 
 
 def diagnose(
     args: "DiagnoseArgs", folders: list[Path], task: str, recorded: Path | None
 ) -> tuple[dict[str, Any], list[str]]:
-    """The diagnosis as JSON data and as lines for people; writes the picture and the numbers."""
+    """The diagnosis as JSON data and as lines for people; writes the numbers, and a picture where there is an
+    estimator.
+    """
     env, priors = load(task, args.impl, folders)
     home = args.out / "diagnose" / env.name
-    if recorded is not None:
-        real, which = read(recorded, env, priors, args.rollouts)
-        simulated = play_simulated(env, priors, args.seed)
-        count = real[0].valid.shape[0]
-        name = "_".join(recorded.parts[-3:] if read_config(recorded) else recorded.parts[-1:])
-        what = f"{_rollouts(count)} recorded in {recorded}"
-    else:
-        count, name, which = args.rollouts or PLAYED, title(args.real), list(range(len(priors)))
-        if is_stepped(args.real):
-            real = _play_real(env, args, priors, count, home / name)
-            simulated = play_simulated(env, priors, args.seed)
-        else:
-            real, simulated = _play_both(env, gaps.load(env, args.real), priors, count, args.seed)
-        where = name if is_stepped(args.real) else f"the gap {name}"
-        who = "one prior" if len(priors) == 1 else f"each of {len(priors)} priors"
-        what = f"{_rollouts(count)} of {who}, just played zero-shot on {where}"
-    labels = [str(folders[p]) for p in which]
-    with doing("examining the rollouts", 40, once=True):
-        examined, mean = _examine(env, priors, real, simulated, which)
-    names = names_of(env)
-    signs, header = verdict.signs(mean[-1], names), f"{env.name}: {what}"
-    findings = {
-        "task": env.name,
-        "data": what,
-        "priors": [{"prior": label, "found": one.statistics} for label, one in zip(labels, examined, strict=True)],
-        "mean": mean,
-        "signs": jsonable(signs),
-        "verdict": verdict.verdict(mean[-1], names),
-        "prediction": predicted(mean[-1]),
-    }
-    home /= name
+    seen = recorded_in(env, priors, recorded, args.rollouts) if recorded else _played(env, priors, args, home)
+    members, labels = [priors[p] for p in seen.which], [str(folders[p]) for p in seen.which]
+    home /= seen.name
     home.mkdir(parents=True, exist_ok=True)
-    picture = figures.diagnosis(home / "diagnosis.png", mean[-1], signs, _points(examined), title=header)
-    write_json(home / "diagnosis.json", findings)
-    lines = [header, *_lines(labels, examined, mean[-1]), "", *findings["verdict"], ""]
-    lines += [f"picture: {picture}", f"numbers: {home / 'diagnosis.json'}"]
+    inferred = _infer(env, members, seen.real, args.seed) if "estimator" in priors[0].card else None
+    with doing("writing down what rollouts say", 10, once=True):
+        looks = [_look(env, prior, rollouts) for prior, rollouts in zip(members, seen.real, strict=True)]
+        said, told = _said(env, home, looks, members, inferred, seen.gap)
+    facts = {"task": env.name, "data": seen.words, **told}
+    facts = jsonable(facts | {"priors": [{"prior": label, **look} for label, look in zip(labels, looks, strict=True)]})
+    write_json(home / "diagnosis.json", facts)
+    lines = [f"{env.name}: {seen.words}", *_rows(labels, looks), "", *said, f"numbers: {home / 'diagnosis.json'}"]
     if env.score == "success" and not (recorded and read_config(recorded)):  # in a run others have played, too
-        n, real = mean[-1]["rollouts"], REMOTE if recorded else args.real
-        chosen = {"task": task, "prior": args.prior or folders[0].parent, "out": args.out}
-        lines.append(advice(n - round(n * mean[-1]["success"]), n, real, **chosen))
-    return jsonable(findings), lines
-
-
-def _examine(
-    env: Env, priors: Sequence[Prior], real: Sequence[Rollouts], simulated: Sequence[Rollouts], which: Sequence[int]
-) -> tuple[list[Examined], list[dict[str, Any]]]:
-    """What real rollouts tell, by each prior that looks at them, and the means after 1, 2, 4, ... and all rollouts.
-
-    simulated: of every prior. which: the prior that looks at each of `real`.
-    """
-    examiner, n = Examiner(priors[0].card, env), real[0].valid.shape[0]
-    counts = sorted({*(2**i for i in range(n.bit_length())), n})
-    params = stacking.stack([prior.params for prior in priors])
-    control = examiner.control(params, stacking.stack(simulated))
-    chosen, usual = (stacking.member(x, jnp.array(which)) for x in (params, control))
-    examined = examiner.examine(chosen, usual, stacking.stack(real), counts)
-    same = all(rollouts is real[0] for rollouts in real)
-    return examined, [average([one.statistics[i] for one in examined], same=same) for i in range(len(counts))]
+        success = np.concatenate([x.success for x in {id(x): x for x in seen.real}.values()])  # each policy's once
+        real, chosen = REMOTE if recorded else args.real, {"task": task, "prior": args.prior or folders[0].parent}
+        lines.append(advice(int((~success).sum()), len(success), real, **chosen, out=args.out))
+    return facts, lines
 
 
 def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior]]:
-    """The task as these priors see it, and the priors; raises UserError for those without V_sim or models."""
+    """The task as these priors see it, and the priors; raises UserError for those without V_sim, or with an estimator
+    of other systems.
+    """
     env = envs.make(task, impl, **variant_of(folders))
-    priors = load_priors(folders, env)
+    priors = load_priors(folders, env, estimators=True)
     for prior in priors:
         api.check_prior(prior, get_method("sgft"), env)
+        if "estimator" in prior.card:
+            check_estimator(prior.card, env)
     return env, priors
 
 
-def names_of(env: Env) -> Names:
-    """What people call the numbers of a task."""
-    action, sensors = ([label for e in entries for label in e.labels] for entries in (env.action, env.measured))
-    units = [e.unit for e in env.measured for _ in range(e.size)]
-    return Names(action, list(zip(sensors, units, strict=True)), env.sensor_errors, env.control_dt, FURTHEST)
+def _infer(env: Env, members: Sequence[Prior], real: Sequence[Rollouts], seed: int) -> Inferred:
+    """What the rollouts of every member say, by its prior's estimator, and what it promises of corrections."""
+    n, key = min(real[0].valid.shape[0], MOST), jax.random.fold_in(jax.random.key(_SEED), seed)
+    counts = sorted({0, *(2**i for i in range(n.bit_length())), n})
+    with doing("building systems that it may be", 10, once=True):
+        possible = candidates(env)
+    judge = jax.jit(functools.partial(infer, env, possible, make_policy(members[0].card, env)))
+    with doing("trying corrections in these systems", 60 * len(members), once=True):
+        points = [posterior(env, prior, x, counts, key) for prior, x in zip(members, real, strict=True)]
+        inferences = [
+            judge(without_estimator(prior.params), prior.params.estimator, readable(env, x), jnp.int32(n), key)
+            for prior, x in zip(members, real, strict=True)
+        ]
+        return Inferred(counts, np.concatenate(points, axis=1), jax.device_get(stacking.stack(inferences)))
 
 
-def average(diagnoses: Sequence[Mapping[str, Any]], *, same: bool) -> dict[str, Any]:
-    """The mean of every number of several diagnoses; their rollouts are added up unless they are the same ones."""
-    mean = jax.tree.map(lambda *x: x[0] if len(set(x)) == 1 else float(np.mean(x)), *diagnoses)
-    return mean if same else {**mean, "rollouts": sum(diagnosis["rollouts"] for diagnosis in diagnoses)}
+def _look(env: Env, prior: Prior, rollouts: Rollouts) -> dict[str, Any]:
+    """Success of a prior's rollouts, and what they make of its V_sim, as JSON data."""
+    value = make_policy(prior.card, env).value
+    assert value is not None  # as `load` has asked
+    values, returns = promises(functools.partial(value, prior.params), rollouts)
+    success = np.asarray(rollouts.success)
+    honest = honesty(np.asarray(values), np.asarray(returns), np.asarray(rollouts.valid))
+    return {"rollouts": len(success), "succeeded": int(success.sum()), "V_sim": honest}
 
 
-def predicted(diagnosis: Mapping[str, Any]) -> dict[str, Any]:
-    """The prediction for one diagnosis, as JSON data."""
-    x = verdict.inputs_of(diagnosis)
-    return {
-        "inputs": jsonable(x),
-        "gain": float(verdict.gain(x)),
-        "rollouts": verdict.AHEAD,
-        "until": {"level": verdict.LEVEL, "rollouts": verdict.rollouts_until(x)},
-    }
+def _said(
+    env: Env,
+    home: Path,
+    looks: Sequence[dict[str, Any]],
+    members: Sequence[Prior],
+    inferred: Inferred | None,
+    gap: Gap | None,
+) -> tuple[list[str], dict[str, Any]]:
+    """Which system it may be, as lines and as JSON data. Draws the picture, and adds to `looks` what is promised."""
+    if inferred is None:
+        return ["Which system it is stays open: no estimator" + f"; {MAKE}" * (env.score == "success"), ""], {}
+    for i, (look, prior) in enumerate(zip(looks, members, strict=True)):
+        one, usual = stacking.member(inferred.inference, i), prior.params.estimator.usual
+        look["promised"] = {"as it is": one.promised[AS_IS], "corrected": one.promised[CORRECTED]}
+        nats = {"nats": one.nats, "usual": usual[min(look["rollouts"], MOST) - 1]}
+        look["contradiction"] = {**nats, "contradicted": one.contradicted}
+    known = narrowed(env, inferred.points, gap)
+    picture = figures.shrinking(home / "posterior.png", *known, inferred.counts, title="Which system is it?")
+    heading = ["", "Which system is it? 80 % intervals of what rollouts tell most of:", ""]
+    lines = [_misfit(looks), *heading, table(known, inferred.counts), "", f"picture: {picture}"]
+    return lines, {"unknowns": {"after": inferred.counts, **known._asdict()}}
 
 
 # --- rollouts ---------------------------------------------------------------------------------------------------------
 
 
-def _play(env: Env, reals: Sequence[Gap], priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
-    """Exploring rollouts [n] of every prior on every gap: [gaps * priors], all priors on the first gap first."""
+def _played(env: Env, priors: list[Prior], args: "DiagnoseArgs", home: Path) -> Evidence:
+    """Zero-shot rollouts of every prior, on a gap or a real system."""
+    count, name, gap = args.rollouts or _PLAYED, title(args.real), None
+    if is_stepped(args.real):
+        real, where = _play_real(env, args, priors, count, home / name), name
+    else:
+        gap, where = gaps.load(env, args.real), f"the gap {name}"
+        real = _play(env, gap, priors, count, args.seed)
+    who = "one prior" if len(priors) == 1 else f"each of {len(priors)} priors"
+    return Evidence(
+        real, list(range(len(priors))), name, f"{_rollouts(count)} of {who}, just played zero-shot on {where}", gap
+    )
+
+
+def recorded_in(env: Env, priors: list[Prior], home: Path, most: int | None) -> Evidence:
+    """Rollouts that a folder holds."""
+    real, which = read(home, env, priors, most)
+    name = "_".join(home.parts[-3:] if read_config(home) else home.parts[-1:])
+    return Evidence(real, which, name, f"{_rollouts(real[0].valid.shape[0])} recorded in {home}")
+
+
+def _play(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
+    """Rollouts [n] of every prior on a gap."""
     key = jax.random.fold_in(jax.random.key(_SEED), seed)
     with doing(f"playing {_rollouts(n)} of each prior", 30, once=True):
-        system, members = systems(env, reals, priors, max(n, 64))
+        system, members = systems(env, [gap], priors, max(n, 64))
         policy = make_policy(priors[0].card, system.env)
-        return _of_members(play(system, policy, members, key, n, explore=True), len(reals) * len(priors))
-
-
-def play_simulated(env: Env, priors: list[Prior], seed: int) -> list[Rollouts]:
-    """Exploring rollouts [SIMULATED] of every prior where nothing differs."""
-    return _play(env, [gaps.find(env.name, SIM)], priors, SIMULATED, seed)
-
-
-def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tuple[list[Rollouts], list[Rollouts]]:
-    """Rollouts [n] of every prior on a gap, and [SIMULATED] in simulation; one program plays both where it can."""
-    if gap.scene:
-        return _play(env, [gap], priors, n, seed), play_simulated(env, priors, seed)
-    both = _play(env, [gap, gaps.find(env.name, SIM)], priors, max(n, SIMULATED), seed)
-    real, simulated = both[: len(priors)], both[len(priors) :]
-    return jax.tree.map(lambda x: x[:n], real), jax.tree.map(lambda x: x[:SIMULATED], simulated)
+        return _of_members(play(system, policy, members, key, n), len(priors))
 
 
 def _play_real(env: Env, args: "DiagnoseArgs", priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
-    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk in `home`."""
+    """Rollouts [n] of every prior on a robot or an environment, each of them kept on disk in `home`."""
     system = connect(env, [args.real], (), members=len(priors), gamma=priors[0].card["gamma"], home=args.out)
     try:
         store = RealStore(home)  # after the connection, which may fail
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
         members = stacking.stack([prior.params for prior in priors])
-        kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
+        rhythm = 1 if is_robot(args.real) else None
+        kept = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=rhythm)
         with doing(f"playing {_rollouts(n)} of each prior"):
-            played = play(kept, make_policy(priors[0].card, env), members, key, n, explore=True)
+            played = play(kept, make_policy(priors[0].card, env), members, key, n)
     finally:
         system.close()
     return _of_members(played, len(priors))
@@ -208,7 +229,8 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     real, config, p = [stacking.member(both, s) for s in range(len(both.success))], read_config(home), len(priors)
     if config:
         known = last_start(home).get("priors", [])
-        if known and known != [digest(prior) for prior in priors]:
+        bare = [Prior(without_estimator(prior.params), prior.card) for prior in priors]  # as most methods begin
+        if known and known not in ([digest(prior) for prior in some] for some in (priors, bare)):
             raise UserError(f"{home}: began with other priors than these; name them with --prior")
         return real, [(config.get("seed", 0) + s) % p for s in range(len(real))]
     if len(real) == 1:
@@ -238,32 +260,30 @@ def _check(
 # --- for people -------------------------------------------------------------------------------------------------------
 
 
-def _points(examined: Sequence[Examined]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """All priors' V_sim and returns, at most 1,000 of each kind."""
-    points = {}
-    for where in ("real", "simulated"):
-        value, returns = (np.concatenate([one.points[where][i] for one in examined]) for i in (0, 1))
-        some = np.random.default_rng(0).permutation(len(value))[:1000]
-        points[where] = (value[some], returns[some])
-    return points
-
-
 def _rollouts(n: int) -> str:
     return f"{n} rollout{'s' * (n > 1)}"
 
 
-def _lines(labels: Sequence[str], examined: Sequence[Examined], mean: dict[str, Any]) -> list[str]:
-    """One line for each prior, and one for their mean."""
-    rows = [("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")]
-    diagnoses = [(label, one.statistics[-1]) for label, one in zip(labels, examined, strict=True)]
-    if len(examined) > 1:
-        diagnoses.append(("mean", mean))
-    for label, diagnosis in diagnoses:
-        n, value, ahead = diagnosis["rollouts"], diagnosis["value"], diagnosis["horizons"].index(4)
-        four = {where: f"{errors[ahead]:.2f}" for where, errors in diagnosis["model_error"].items()}
-        success = tables.number(stats.success_interval(round(n * diagnosis["success"]), n))
-        improvable, short = f"{100 * value['real'][0]['improvable']:.0f}", f"{value['shortfall']:.1f} sd"
-        model = f"{four['real']} -> {four['identified']} ({four['simulated']})"
-        gain = f"{100 * verdict.gain(verdict.inputs_of(diagnosis)):+.0f}"
-        rows.append((label, success, improvable, short, f"{value['rank_correlation']:.2f}", model, gain))
+def _rows(labels: Sequence[str], looks: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One line for each prior."""
+    head = ["prior", "success %", "V_sim promises", "returned", "rank"]
+    promised = "promised" in looks[0]
+    rows = [(*head, "simulation promises %: as it is", "corrected") if promised else tuple(head)]
+    for label, look in zip(labels, looks, strict=True):
+        success = tables.number(stats.success_interval(look["succeeded"], look["rollouts"]))
+        value = [f"{x:.2f}" for x in look["V_sim"].values()]
+        rows.append((label, success, *value, *(f"{100 * x:.0f}" for x in look.get("promised", {}).values())))
     return columns(rows)
+
+
+def _misfit(looks: Sequence[Mapping[str, Any]]) -> str:
+    """Whether one of the simulator's systems may have made the rollouts."""
+    nats, usual, contradicted = (
+        np.mean([look["contradiction"][key] for look in looks]) for key in ("nats", "usual", "contradicted")
+    )
+    if looks[0]["rollouts"] < 2:
+        return "One rollout does not tell whether any of the simulator's systems made it: play two."
+    numbers = f"halves of them contradict each other by {nats:.0f} nats (95 % of its systems: below {usual:.0f})"
+    if contradicted >= 0.5:
+        return f"None of the simulator's systems made these rollouts: {numbers}. Neither intervals nor promises hold."
+    return f"One of the simulator's systems may have made these rollouts: {numbers}. Drift and warps can stay unseen."

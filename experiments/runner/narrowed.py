@@ -1,27 +1,24 @@
-"""Impure: what the rollouts of a run of `posterior` tell of its real system, beside what is true of it."""
+"""What rollouts tell of a real system's unknowns, for people, beside what is true of it. Pure."""
 
 import functools
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-import envs
 from envs import gaps
 from envs.base import Env, World
-from envs.mujoco.worlds import choose_impl
+from envs.gaps import Gap
+from envs.rollout import real_env
 from envs.types import Array, Key
-from experiments.runner.diagnose_run import names_of
-from experiments.runner.finetune_args import FinetuneArgs, priors_of
-from experiments.runner.options import episodes_of
-from sgft_jax.io.priors import load_prior, variant
-from sgft_jax.io.real import Played
+from sgft_jax.analysis import tables
+from sgft_jax.diagnosis import Rollouts
 from sgft_jax.posterior.candidates import Unknown, unknowns_of, values
 from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.stacking import member
+from sgft_jax.types import Prior
 
 _DRAWS = 1000  # points of a posterior that say how wide it is
 _SHOWN = 6
@@ -34,31 +31,65 @@ _WORDS = {
 
 
 class Narrowed(NamedTuple):
-    """The unknowns [k] that rollouts tell most of. names: with units. truth: [k]. intervals: [n + 1, k, 2], 80 % of the
-    posterior after 0 to n rollouts; sensor errors of lengths in mm.
+    """The unknowns [k] that rollouts tell most of. names: with units. intervals: [n, k, 2], 80 % of the posterior after
+    each number of rollouts; sensor errors of lengths in mm. truth: [k], None where nobody knows it.
     """
 
     names: list[str]
-    truth: np.ndarray
     intervals: np.ndarray
+    truth: np.ndarray | None
 
 
-def narrowed(run: FinetuneArgs, home: Path) -> Narrowed:
-    """Of the first seed and real system of a run in a folder."""
-    prior = load_prior(priors_of(run)[0])
-    env = envs.make(run.task, choose_impl(run.impl), **variant(prior.card))
-    unknowns, key = unknowns_of(env), jax.random.key(run.seed)
-    played = episodes_of(home, run.seed)[:MOST]
-    points = _drawn(prior.params.estimator, _read(env, played), len(played), len(unknowns), key)
-    numbers = np.asarray(jax.vmap(jax.vmap(functools.partial(values, unknowns)))(points))
-    std = np.asarray(points.std(axis=1))
+def readable(env: Env, rollouts: Rollouts) -> Rollout:
+    """The first recorded episodes as the estimator reads them, [MOST], steps that an episode of the task lacks cut."""
+    room = blank(MOST, env.episode_length, env.measured_dim, env.act_dim)
+    rows, valid, success = jax.tree.map(lambda x: x[:MOST], tuple(rollouts))
+    rows, valid = jax.tree.map(lambda x: x[:, : env.episode_length], (rows, valid))
+    read = jax.vmap(functools.partial(rollout_of, env))(rows, valid, success)
+    return jax.tree.map(lambda room, x: room.at[tuple(map(slice, x.shape))].set(x), room, read)
+
+
+def posterior(env: Env, prior: Prior, rollouts: Rollouts, counts: Sequence[int], key: Key) -> np.ndarray:
+    """[len(counts), draws, d] points that the first so many rollouts allow, by the prior's estimator; before any, those
+    of the prior over unknowns.
+    """
+    d = len(unknowns_of(env))
+
+    @jax.jit
+    def after(estimator: Estimator, read: Rollout, count: Array) -> Array:
+        return draw(estimator, read, jnp.arange(MOST) < count, d, key, _DRAWS)
+
+    read, before = readable(env, rollouts), jax.random.uniform(key, (_DRAWS, d))
+    return np.stack([after(prior.params.estimator, read, jnp.int32(n)) if n else before for n in counts])
+
+
+def narrowed(env: Env, points: np.ndarray, gap: Gap | None) -> Narrowed:
+    """Of points [n, draws, d] after ever more rollouts, the first before any. gap: the real system, where one knows."""
+    unknowns = unknowns_of(env)
+    numbers = np.asarray(jax.jit(jax.vmap(jax.vmap(functools.partial(values, unknowns))))(points))
+    std = points.std(axis=1)
     best = np.argsort(std[-1] / std[0])[:_SHOWN]
     labels = [_label(env, unknowns[i]) for i in best]
     scale = np.array([scale for _, scale in labels])
     bounds = np.moveaxis(np.quantile(numbers[..., best], (0.1, 0.9), axis=1), 0, -1)
-    world = member(gaps.worlds(env, gaps.load(env, run.real[0]), jax.random.key(0), 1), 0)
-    known = truth(env, world, [unknowns[i] for i in best])
-    return Narrowed([name for name, _ in labels], scale * known, scale[:, None] * bounds)
+    known = None
+    if gap is not None and not gap.scene:  # another scene has other parameters
+        pool = gaps.worlds(real_env(env, [gap]), gap, jax.random.key(0), 1)
+        known = scale * truth(env, member(pool, 0), [unknowns[i] for i in best])
+    return Narrowed([name for name, _ in labels], scale[:, None] * bounds, known)
+
+
+def table(known: Narrowed, counts: Sequence[int]) -> str:
+    """Intervals after so many rollouts, and the truth where it is known, in Markdown."""
+    head = ["", *(f"{n} rollout{'s' * (n != 1)}" for n in counts)]
+    rows = [
+        [name, *(f"{low:.3g} to {high:.3g}" for low, high in known.intervals[:, i])]
+        for i, name in enumerate(known.names)
+    ]
+    if known.truth is not None:
+        head.append("true")
+        rows = [[*row, f"{true:.3g}"] for row, true in zip(rows, known.truth, strict=True)]
+    return tables.markdown(head, rows)
 
 
 def truth(env: Env, world: World, unknowns: Sequence[Unknown]) -> np.ndarray:
@@ -74,36 +105,14 @@ def truth(env: Env, world: World, unknowns: Sequence[Unknown]) -> np.ndarray:
     return np.array([value(unknown) for unknown in unknowns])
 
 
-def _read(env: Env, played: Sequence[Played]) -> Rollout:
-    """Stored episodes as the estimator reads them, [MOST]."""
-    steps, rollouts = env.episode_length, blank(MOST, env.episode_length, env.measured_dim, env.act_dim)
-    for i, episode in enumerate(played):
-        missing = steps - len(episode.rows.reward)
-        rows = jax.tree.map(lambda x, n=missing: np.pad(x, [(0, n), *[(0, 0)] * (x.ndim - 1)]), episode.rows)
-        rollout = rollout_of(env, rows, jnp.arange(steps) < steps - missing, jnp.asarray(episode.success))
-        rollouts = jax.tree.map(lambda room, x, i=i: room.at[i].set(x), rollouts, rollout)
-    return rollouts
-
-
-def _drawn(estimator: Estimator, rollouts: Rollout, count: int, d: int, key: Key) -> Array:
-    """[count + 1, draws, d] points of the prior over unknowns, then of the posteriors after 1, 2, ... rollouts."""
-
-    @jax.jit
-    def after(number: Array) -> Array:
-        return draw(estimator, rollouts, jnp.arange(MOST) < number, d, key, _DRAWS)
-
-    before = jax.random.uniform(key, (_DRAWS, d))
-    return jnp.stack([before, *(after(jnp.int32(n + 1)) for n in range(count))])
-
-
 def _label(env: Env, unknown: Unknown) -> tuple[str, float]:
     """An unknown with its unit, for people, and what its numbers are multiplied by."""
     words = _WORDS.get(unknown.name, unknown.name.replace("_", " "))
     units = {p.name: p.unit for p in env.parameters} | {"action_rotation": "rad", "latency": "s"}
-    unit, scale, names = units.get(unknown.name, ""), 1.0, names_of(env)
+    unit, scale = units.get(unknown.name, ""), 1.0
     if unknown.name in ("action_scale", "action_bias"):
-        words = f"{words} {names.action[unknown.index]}"
+        words = f"{words} {[label for entry in env.action for label in entry.labels][unknown.index]}"
     elif unknown.name == "obs_bias":
-        label, unit = names.sensors[unknown.index]
+        label, unit = [(label, entry.unit) for entry in env.measured for label in entry.labels][unknown.index]
         words, unit, scale = f"{words} {label}", *(("mm", 1000.0) if unit == "m" else (unit, 1.0))
     return f"{words}, {unit}" if unit else words, scale

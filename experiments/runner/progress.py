@@ -56,7 +56,7 @@ class _Voice:
         if self.heard is None:
             if cpu > _FIRST or lasts > _AGAIN:
                 self.announce(phase.words, "some seconds")
-        elif now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
+        elif now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)) and (self.phases or lasts >= 1):
             more = ", compiling" if compiling() else ""
             far = "" if phase.far is None else f"{phase.far:.0%}, ".replace("%", " %")
             say(f"still {phase.words} ({far}{_duration(lasts)} so far{more})" if lasts >= 1 else phase.words)

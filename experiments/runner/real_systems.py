@@ -169,10 +169,9 @@ def described(env: Env, real: str, changes: Sequence[str]) -> Gap:
 
 def advice(failed: int, count: int, real: str, **chosen: Any) -> str:
     """Which method suits a policy that has failed so often (docs/diagnose.md), as a command. chosen: its options."""
-    from sgft_jax.analysis.verdict import choice
-
     more, seeds = "" if count >= ENOUGH else f", {ENOUGH} say more", 1 if is_robot(real) else None
-    command = options.command("finetune", **chosen, real=real, seeds=seeds, method=choice(failed, count))
+    method = "guarded" if 10 * failed >= 3 * count else "sac"
+    command = options.command("finetune", **chosen, real=real, seeds=seeds, method=method)
     return cli.as_typed(f"{failed} of {count} failed{more}: next: {command}")
 
 

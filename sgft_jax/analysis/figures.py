@@ -22,7 +22,6 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.curves import Curve, by_prior, spread
-from sgft_jax.analysis.verdict import Sign
 from sgft_jax.math.stats import ENOUGH, Interval, iqm
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -36,7 +35,6 @@ _METHODS = """
     posterior wsrl asymmetric"""
 COLOURS: dict[str, str] = dict(zip(_METHODS.split(), (*PALETTE, *_MORE.split()), strict=True))  # all far apart
 
-type Points = Mapping[str, tuple[np.ndarray, np.ndarray]]  # [n] V_sim and [n] returns, by where they are from
 
 _INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
 _FONT = {"size": 10, "color": _INK}
@@ -196,44 +194,6 @@ def pretraining(
     return _save(figure, path, title)
 
 
-def diagnosis(path: Path, diagnosis: Mapping[str, Any], signs: Sequence[Sign], points: Points, *, title: str) -> Path:
-    """Panels: improvable states by horizon, V_sim against what happened, model error by horizon, signs of the gap.
-
-    diagnosis: see `examination.describe`. signs: see `verdict.signs`. points: by "real" and "simulated".
-    """
-    figure, (states, promise, model, kinds) = _figure(10.4, 6.6, 2, 4)
-    horizons = diagnosis["horizons"]
-    for where, colour in (("simulated", _FAINT), ("real", PALETTE[0])):
-        for name, dash in (("improvable", "-"), ("improving", ":")):
-            shares = [by_name[name] for by_name in diagnosis["value"][where]]
-            states.plot(horizons, shares, dash, color=colour, linewidth=2, label=f"{name}, {where}", clip_on=False)
-        value, returns = points[where]
-        promise.scatter(returns, value, s=6, color=colour, alpha=0.6, linewidths=0, label=where)
-    states.set_ylim(-0.03, 1.03)
-    _name(states, "states where the best action keeps / exceeds V_sim", "steps ahead")
-    both = np.concatenate([x for pair in points.values() for x in pair])
-    promise.plot(*[(both.min(), both.max())] * 2, color=_GREY, linewidth=1, zorder=0)
-    _name(promise, "V_sim against discounted return", "return that followed")
-    colours = {"simulated": _FAINT, "real": PALETTE[1], "identified": PALETTE[0]}
-    for where, colour in colours.items():
-        errors, label = diagnosis["model_error"][where], "real, identified" if where == "identified" else where
-        model.plot(horizons, errors, color=colour, linewidth=2, marker="o", markersize=3, label=label)
-    model.set_ylim(bottom=0)
-    _name(model, "model error, standard deviations", "steps ahead")
-    for axes in (states, model):
-        axes.set_xticks(horizons)
-    for axes in (states, promise, model):
-        axes.legend(frameon=False, fontsize=8, labelcolor=_INK)
-    strengths = np.array([min(sign.strength, 3.0) for sign in signs])
-    kinds.barh(np.arange(len(signs)), strengths, color=[PALETTE[1] if x >= 1 else _FAINT for x in strengths])
-    kinds.set_yticks(np.arange(len(signs)), [sign.name for sign in signs])
-    kinds.invert_yaxis()
-    kinds.set_xlim(0, 3)
-    kinds.axvline(1.0, color=_GREY, linewidth=1)
-    _name(kinds, "signs of the gap; one counts from 1 on")
-    return _save(figure, path, title)
-
-
 def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float], *, title: str) -> Path:
     """Episodes over time, one after another: a panel for each quantity, all with one time axis.
 
@@ -286,18 +246,27 @@ def effects(path: Path, intervals: Mapping[str, Mapping[str, Mapping[str, Interv
     return _save(figure, path, "effect of each part, mean over all others")
 
 
-def shrinking(path: Path, names: Sequence[str], truth: np.ndarray, intervals: np.ndarray, *, title: str) -> Path:
+def shrinking(
+    path: Path,
+    names: Sequence[str],
+    intervals: np.ndarray,
+    truth: np.ndarray | None,
+    counts: Sequence[int],
+    *,
+    title: str,
+) -> Path:
     """How intervals shrink around the truth: a panel for each unknown, a bar for each number of rollouts.
 
-    truth: [k]. intervals: [n + 1, k, 2], the first before any rollout.
+    intervals: [n, k, 2] after `counts` [n] rollouts, the first before any. truth: [k], None where nobody knows it.
     """
     columns = min(len(names), 3)
     figure, panels = _figure(3.4 * columns, 1.6 * math.ceil(len(names) / columns) + 0.6, columns, len(names))
     heights = np.arange(len(intervals))
     for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
         axes.hlines(heights, *intervals[:, i].T, color=[_FAINT, *[PALETTE[0]] * (len(heights) - 1)], linewidth=5)
-        axes.axvline(truth[i], color=PALETTE[1], linewidth=1.5)
-        axes.set_yticks(heights, [f"{n} rollouts" if n != 1 else "1 rollout" for n in heights])
+        if truth is not None:
+            axes.axvline(truth[i], color=PALETTE[1], linewidth=1.5)
+        axes.set_yticks(heights, [f"{n} rollouts" if n != 1 else "1 rollout" for n in counts])
         axes.set_ylim(len(heights) - 0.5, -0.5)
         axes.tick_params(labelleft=i % columns == 0)
         axes.locator_params(axis="x", nbins=5)

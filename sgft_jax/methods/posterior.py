@@ -12,8 +12,6 @@ from sgft_jax import checks
 from sgft_jax.train.options import LoopOptions, card_of
 from sgft_jax.types import Finetuner, Method, Online, Prior, Simulation, Task
 
-_MAKE = "`python -m experiments.estimate --prior PRIOR` makes it"
-
 
 @dataclass(frozen=True)
 class Config(checks.Checked):
@@ -32,16 +30,13 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.models.distortion import command_interface
     from sgft_jax.policies import sac_policy
     from sgft_jax.posterior.candidates import candidates
-    from sgft_jax.posterior.interface import deployed, entry_of, posterior_interface
+    from sgft_jax.posterior.interface import check_estimator, deployed, posterior_interface
     from sgft_jax.train.finetuner import assemble, unlearned
 
     if not isinstance(task, Env):
         raise UserError("method posterior: this task has no simulator in which systems could be tried; use `sac`")
     card = card_of(prior)
-    if not (entry := card.get("estimator")):
-        raise UserError(f"method posterior: the prior has no estimator; {_MAKE}")
-    if entry != entry_of(task):
-        raise UserError(f"method posterior: the prior's estimator knows other systems than {task.name}; {_MAKE}")
+    check_estimator(card, task)
     network = network_of(card)
     policy, systems = sac_policy(task.obs_dim, task.act_dim, network), candidates(task)
     parts = unlearned(policy, lambda params, key: ((), params._replace(estimator=None)), lambda state: state.frozen)

@@ -5,6 +5,7 @@ what they promise, and so whether the prior as it is, behind the correction that
 one that fits real steps best is deployed, see `trust`.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +20,8 @@ from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, contra
 from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, challenger, expected, incumbent, update
 from sgft_jax.stacking import member, stack
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
+
+MAKE = "`python -m experiments.estimate --prior PRIOR` makes it"
 
 
 class Believed(NamedTuple):
@@ -42,6 +45,20 @@ class Believed(NamedTuple):
     key: Key
 
 
+class Inference(NamedTuple):
+    """What rollouts say. distortion: the correction that does best in the systems that may have made them. promised:
+    [2 + n] success there of the prior as it is, behind that, and behind each of n other corrections.
+
+    nats: [] by which halves of the rollouts contradict each other. contradicted: [] bool, whether that is more than in
+    95 % of the simulator's systems; of one rollout never.
+    """
+
+    distortion: Distortion
+    promised: Array
+    nats: Array
+    contradicted: Array
+
+
 class Deployed(NamedTuple):
     """agent: the state of what adapts. first: params of the simulator's policy. challenger: [] the policy of
     `trust` that plays the next rollout. incumbent: [] the one that is deployed.
@@ -54,6 +71,31 @@ class Deployed(NamedTuple):
     incumbent: Array
 
 
+def infer(
+    env: Env,
+    systems: Candidates,
+    policy: Policy,
+    params: PyTree,
+    estimator: Estimator,
+    rollouts: Rollout,
+    count: Array,
+    key: Key,
+    *others: Distortion,
+) -> Inference:
+    """What the first `count` [] of rollouts [MOST] say of a system, and which policy is best there.
+
+    params: of the policy that plays in simulation. others: corrections that are candidates beside those of the
+    posterior.
+    """
+    counts, d = jnp.arange(MOST) < count, len(systems.unknowns)
+    key_points, key_choice, key_halves = jax.random.split(key, 3)
+    points = draw(estimator, rollouts, counts, d, key_points, CANDIDATES + JUDGES)
+    distortion, promised = choose(env, systems, policy, params, points, key_choice, *others)
+    nats = contradiction(estimator, rollouts, counts, d, key_halves)
+    usual = estimator.usual[jnp.minimum(count, MOST) - 1]
+    return Inference(distortion, promised, nats, (count > 1) & (nats > usual))
+
+
 def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: Interface) -> Interface:
     """Identification by the estimator of a prior. env: the task in the simulator, as the policy observes it. fitting:
     identification by the prior's models.
@@ -63,7 +105,7 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: 
 
     def start(params: PyTree, key: Key) -> Believed:
         if params.estimator is None:
-            raise UserError("this prior has no estimator of systems; `python -m experiments.estimate` makes it")
+            raise UserError(f"these params have no estimator; {MAKE}")
         return Believed(
             params=params._replace(estimator=None, critic=None, value=None, dynamics=None),
             estimator=params.estimator,
@@ -84,19 +126,17 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: 
             return known
         last, place = rollout_of(env, *seen.rollout), known.count % MOST
         rollouts = jax.tree.map(lambda rows, row: rows.at[place].set(row), known.rollouts, last)
-        fit, count, d = fitting.refit(known.fit, seen), known.count + 1, len(systems.unknowns)
-        counts = jnp.arange(MOST) < count
-        key_points, key_choice, key_halves = jax.random.split(jax.random.fold_in(known.key, count), 3)
-        points = draw(known.estimator, rollouts, counts, d, key_points, CANDIDATES + JUDGES)
-        distortion, promised = choose(env, systems, policy, known.params, points, key_choice, fit.distortion)
-        nats = contradiction(known.estimator, rollouts, counts, d, key_halves)
+        fit, count = fitting.refit(known.fit, seen), known.count + 1
+        asked = env, systems, policy, known.params, known.estimator, rollouts, count
+        inference = infer(*asked, jax.random.fold_in(known.key, count), fit.distortion)
+        fitted = jnp.where(_equal(fit.distortion, nothing), jnp.nan, inference.promised[FITTED])
         return known._replace(
             rollouts=rollouts,
             count=count,
-            distortion=distortion,
+            distortion=inference.distortion,
             fit=fit,
-            contradicted=(count > 1) & (nats > known.estimator.usual[jnp.minimum(count, MOST) - 1]),
-            promised=promised.at[FITTED].set(jnp.where(_equal(fit.distortion, nothing), jnp.nan, promised[FITTED])),
+            contradicted=inference.contradicted,
+            promised=inference.promised.at[FITTED].set(fitted),
         )
 
     return Interface(start, prepare, refit)
@@ -170,6 +210,14 @@ def entry_of(env: Env) -> dict[str, Any]:
         raise UserError(f"the posterior promises success, and {env.name} is judged by its return; take another method")
     unknowns = [unknown._asdict() for unknown in unknowns_of(env)]
     return {"unknowns": unknowns, "steps": env.episode_length, "measured": env.measured_dim}
+
+
+def check_estimator(card: Mapping[str, Any], env: Env) -> None:
+    """Raises UserError where a prior's card names no estimator of this task's systems."""
+    if not (entry := card.get("estimator")):
+        raise UserError(f"the prior has no estimator; {MAKE}")
+    if entry != entry_of(env):
+        raise UserError(f"the prior's estimator knows other systems than {env.name}; {MAKE}")
 
 
 def _equal(a: PyTree, b: PyTree) -> Array:

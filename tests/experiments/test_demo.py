@@ -3,36 +3,14 @@
 import re
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import pytest
-import toy
-import untrained
+from priors_by_hand import save_with_estimator
 
 import envs
 from envs.types import UserError
 from experiments import demo
 from experiments.runner import narrowed
-from sgft_jax.files.disk import jsonable
-from sgft_jax.io.priors import save_prior
-from sgft_jax.learners.sac import SACConfig
-from sgft_jax.models.config import NetworkConfig
-from sgft_jax.posterior import decision, estimator, interface
-from sgft_jax.types import Normalizer, Prior
-
-NET = NetworkConfig(hidden=(8,))
-
-
-def prior():
-    """Of the point mass, with an estimator that has learned nothing."""
-    env = toy.make()
-    entry = interface.entry_of(env)
-    zeros = estimator.shaped(entry["steps"], entry["measured"], env.act_dim, len(entry["unknowns"]))
-    unlearned = zeros._replace(statistics=estimator.Statistics(jnp.zeros(4), jnp.ones(4), jnp.ones(4)))
-    params = untrained.sac_params(SACConfig(4, 2, network=NET, ensemble_size=2), jax.random.key(1))
-    card = {"task": "toy", "obs_dim": 4, "act_dim": 2, "gamma": 0.9, "algorithm": "sac", "network": jsonable(NET)}
-    still = Normalizer(jnp.zeros(4), jnp.ones(4))
-    return Prior(params._replace(normalizer=still, estimator=unlearned), card | {"estimator": entry})
+from sgft_jax.posterior import decision, interface
 
 
 @pytest.mark.slow
@@ -44,7 +22,7 @@ def test_the_demo_tells_what_rollouts_say_of_the_system(tmp_path, monkeypatch, c
     monkeypatch.setattr(narrowed, "_SHOWN", 20)  # all: the estimator tells nothing of any
     gap = tmp_path / "turned.toml"
     gap.write_text("[params]\nmass = 2.0\n[effects]\naction_rotation = 0.52\n")
-    save_prior(tmp_path / "prior", prior())
+    save_with_estimator(tmp_path / "prior")
     demo.main(demo.DemoArgs("toy", tmp_path / "prior", str(gap), video=False, out=tmp_path / "demo"))
     tables = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
     (turned,) = [row for row in tables if "rotation of commands, rad" in row[0]]

@@ -150,7 +150,7 @@ def test_diagnosis_keeps_the_rollouts_that_it_plays(priors, tmp_path, capsys):
     shutil.copytree(kept / "real", tmp_path / "copy/real")
     call("--real", str(tmp_path / "copy"))
     again = json.loads(capsys.readouterr().out)
-    assert len(Turned.seeds) == 4 and first["mean"] == again["mean"]
+    assert len(Turned.seeds) == 4 and first["priors"] == again["priors"]
 
 
 # --- what does not fit ------------------------------------------------------------------------------------------------

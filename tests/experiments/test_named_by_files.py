@@ -11,7 +11,6 @@ from envs.types import UserError
 from experiments import diagnose, evaluate, export, export_data, replay
 from experiments.runner import cli, finetune_args, grid, tuned
 from experiments.runner.options import prior_folders, task_of_priors
-from experiments.studies import diagnose_calibrate as calibrate
 from sgft_jax import api
 from sgft_jax.analysis import release
 from sgft_jax.files.disk import ASIDE
@@ -56,7 +55,6 @@ OF_RUNS = [
     (replay.main, replay.ReplayArgs, "--run", "run"),
     (export_data.main, export_data.ExportDataArgs, "--run", "run", "--to", "minari"),
     (diagnose.main, diagnose.DiagnoseArgs, "--real", "run", "--prior", "prior"),
-    (calibrate.main, calibrate.CalibrateArgs, "--runs", "run", "--check", "other", "--prior", "prior"),
 ]
 
 

@@ -176,7 +176,12 @@ def test_the_phases_of_every_command():
         "benchmark": {"measuring ...: ..."},
         "collect_run": {"compiling the training", "playing the episodes to record"},
         "demo": {"drawing from the posterior"},
-        "diagnose_run": {"playing ... of each prior", "examining the rollouts"},
+        "diagnose_run": {
+            "playing ... of each prior",
+            "building systems that it may be",
+            "trying corrections in these systems",
+            "writing down what rollouts say",
+        },
         "estimate": {"compiling the simulator and worlds of ..."},
         "estimating": {
             "simulating ... rollouts of ... to learn from",

@@ -72,16 +72,6 @@ ROWS = [
     ("diagnose --prior prior --seed -1", "--seed is -1: seeds go from 0 to 2147483647"),
     ("diagnose --prior prior --out file", "file is a file"),
     ("diagnose --prior prior --out loop", "loop is a link that leads nowhere"),
-    ("studies.diagnose_calibrate --check run", "--runs is missing"),
-    (
-        "studies.diagnose_calibrate --runs empty",
-        "--runs empty: holds no fine-tuning run with recorded rollouts (eval.jsonl an",
-    ),
-    ("studies.diagnose_calibrate --runs run --check run", "--check: run is also in --runs"),
-    (
-        "studies.diagnose_calibrate --runs nowhere",
-        "--runs nowhere: holds no fine-tuning run with recorded rollouts (eval.json",
-    ),
     ("diagnose --prior piped", "piped/prior.json: is no plain file"),
     ("diagnose --prior prior --task hammer", "prior: is a prior of the task 'push', not of 'hammer'"),
     ("figures --out file", "file is a file"),
@@ -108,7 +98,6 @@ ROWS = [
 HEAVY = [
     ("export_data --run run --to minari --task hammer", "run: has 4 observations and 2 actions, hammer has"),
     ("replay --run run --task hammer", "run: has 4 observations and 2 actions, hammer has"),
-    ("studies.diagnose_calibrate --runs run", "run/eval.jsonl:1: lacks rollouts"),
     ("figures", "runs/finetune: holds no evaluated run to draw"),
     ("figures --out empty", "empty/finetune: holds no evaluated run to draw"),
     ("figures --data nowhere", "nowhere: holds no curves-*.csv"),

@@ -118,9 +118,4 @@ ROWS = [
 HEAVY = [
     *[("figures --out bad", words, {f"bad/{_OWN}-0/eval.jsonl": text}) for text, words in _LINES],
     *[("figures --data bad --out bad", words, {"bad/curves-push.csv": text}) for text, words in _TABLES],
-    (
-        "studies.diagnose_calibrate --runs bad",
-        "eval.jsonl:1: lacks rollouts",
-        {f"bad/{_OWN}-0/eval.jsonl": _LINES[4][0], f"bad/{_OWN}-0/real/rollout-000000.npz": ""},
-    ),
 ]
