@@ -25,6 +25,7 @@ from experiments.runner.options import Impl, at_least_one, check_task, each_once
 from experiments.runner.progress import doing
 from sgft_jax.io.log import write_summary
 from sgft_jax.io.runs import check_folder, provenance
+from sgft_jax.methods import get_method
 from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 
@@ -67,6 +68,8 @@ class BenchmarkConfig:
     """Folder of the priors that finetune and system start from."""
     rollouts: int = 30
     """Real rollouts, for finetune."""
+    method: str = "sgft-sac"
+    """Method, for finetune."""
     out: Path = Path("runs")
     """The numbers go to <out>/benchmark/summary.json."""
 
@@ -102,6 +105,8 @@ def _check(config: BenchmarkConfig) -> None:
     if config.env_steps is not None:
         at_least_one(config, "env_steps")
     check_folder(config.out / "benchmark")
+    if "finetune" in config.parts:
+        get_method(config.method)
     for part in {"finetune", "system"} & {*config.parts}:
         if config.prior is None:
             raise UserError(f"--parts {part} needs --prior FOLDER, as made by python -m experiments.pretrain")
@@ -132,7 +137,7 @@ _KINDS: dict[Part, _Kind] = {
     "plain": _Kind("updates of plain SAC", "updates.plain_speed", {"batch": "batches"}, _UPDATES),
     "hybrid": _Kind("updates of hybrid runs", "updates.hybrid_speed", {**_TASK, "members": "seeds"}, _UPDATES),
     "startup": _Kind("from command to priors", "startup.to_priors", _SEEDS, ("preset", "env_steps")),
-    "finetune": _Kind("fine-tuning with SGFT-SAC", "training.fine_tuning", _SEEDS, ("prior", "rollouts")),
+    "finetune": _Kind("fine-tuning", "training.fine_tuning", _SEEDS, ("prior", "rollouts", "method")),
     "system": _Kind("fine-tuning through a real system", "training.through_system", _SEEDS, ("prior", "repeats")),
     "devices": _Kind(
         "pretraining on several devices", "training.weak_scaling", _DEVICES, ("devices", "preset", "env_steps")

@@ -64,18 +64,18 @@ def weak_scaling(
     return lines
 
 
-def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int) -> dict[str, Any]:
-    """Seconds of SGFT-SAC from that prior, its curve included, and those of the median rollout with its updates."""
+def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int, method: str) -> dict[str, Any]:
+    """Seconds of a method from that prior, its curve included, and those of the median rollout with its updates."""
 
     def run(out: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         chosen = {"task": task, "seeds": seeds, "rollouts": rollouts, "prior": prior, "impl": impl}
-        args = arguments("sgft-sac", **chosen, video=False, out=out)
+        args = arguments(method, **chosen, video=False, out=out)
         (summary,) = finetune(args)
         return summary, read_jsonl(run_folder(args, *args.real) / "timing.jsonl")
 
     first_s, ((summary, timing), seconds) = _twice(run)
     rollout_s = statistics.median(line["time/rollout_s"] for line in timing[1:])
-    line = {"task": task, "impl": summary["impl"], "seeds": seeds, "rollouts": rollouts}
+    line = {"task": task, "method": method, "impl": summary["impl"], "seeds": seeds, "rollouts": rollouts}
     return line | {"seconds": seconds, "first_run_s": first_s, "rollout_s": rollout_s}
 
 

@@ -86,6 +86,7 @@ ROWS = [
     ("benchmark --preset nope", "--preset: there is no 'nope'"),
     ("benchmark --parts finetune", "--parts finetune needs --prior FOLDER, as made by python -m experiments.pretrain"),
     ("benchmark --parts finetune --prior nowhere", "--prior nowhere: no such folder"),
+    ("benchmark --parts finetune --prior prior --method sak", "method: there is no 'sak', did you mean 'sac'?"),
     ("benchmark --parts system --prior prior --tasks hammer", "prior: is a prior of the task 'push', not of 'hammer'"),
     ("benchmark --parts startup --env-steps 0", "--env-steps is 0: must be at least 1"),
     ("benchmark --rollouts 0", "--rollouts is 0: must be at least 1"),
