@@ -149,6 +149,7 @@ def _said(
         look["promised"] = {"as it is": one.promised[AS_IS], "corrected": one.promised[CORRECTED]}
         nats = {"nats": one.nats, "usual": usual[min(look["rollouts"], MOST) - 1]}
         look["contradiction"] = {**nats, "contradicted": one.contradicted}
+        look["current"] = int(one.current.sum())
     known = narrowed(env, inferred.points, gap)
     picture = figures.shrinking(home / "posterior.png", *known, inferred.counts, title="Which system is it?")
     heading = ["", "Which system is it? 80 % intervals of what rollouts tell most of:", ""]
@@ -286,4 +287,6 @@ def _misfit(looks: Sequence[Mapping[str, Any]]) -> str:
     numbers = f"halves of them contradict each other by {nats:.0f} nats (95 % of its systems: below {usual:.0f})"
     if contradicted >= 0.5:
         return f"None of the simulator's systems made these rollouts: {numbers}. Neither intervals nor promises hold."
-    return f"One of the simulator's systems may have made these rollouts: {numbers}. Drift and warps can stay unseen."
+    if (current := min(look["current"] for look in looks)) < min(looks[0]["rollouts"], MOST):
+        return f"The system changes: earlier rollouts contradict later ones. Promises are of the last {current}, intervals of all."
+    return f"One of the simulator's systems may have made these rollouts: {numbers}. Warps can stay unseen."

@@ -201,11 +201,18 @@ def draw(estimator: Estimator, rollouts: Rollout, counts: Array, d: int, key: Ke
     return jax.vmap(one)(jax.random.split(key, n))
 
 
-def contradiction(estimator: Estimator, rollouts: Rollout, counts: Array, d: int, key: Key) -> Array:
-    """[] nats by which systems are less probable to one half of the rollouts than to the other, from which they are
-    drawn. Large where no system has made them all; small for one rollout. Arguments as of `log_density`.
-    """
+def alternating(counts: Array) -> tuple[Array, Array]:
+    """[k] bool, every other of the rollouts that count [k], and those between."""
     first = counts & (jnp.cumsum(counts) % 2 == 1)
+    return first, counts & ~first
+
+
+def contradiction(estimator: Estimator, rollouts: Rollout, halves: tuple[Array, Array], d: int, key: Key) -> Array:
+    """[] nats by which systems are less probable to one half of the rollouts than to the other, from which they are
+    drawn. Large where no system has made them all; small for one rollout.
+
+    rollouts: [k]. halves: [k] bool each. d: numbers of a system.
+    """
 
     def one_way(here: Array, there: Array, key: Key) -> Array:
         def nats(counts: Array, point: Array) -> Array:
@@ -215,7 +222,7 @@ def contradiction(estimator: Estimator, rollouts: Rollout, counts: Array, d: int
         of_points = jax.vmap(nats, (None, 0))
         return jnp.mean(of_points(here, points) - of_points(there, points))
 
-    keys, second = jax.random.split(key), counts & ~first
+    (first, second), keys = halves, jax.random.split(key)
     return (one_way(first, second, keys[0]) + one_way(second, first, keys[1])) / 2
 
 

@@ -16,11 +16,12 @@ from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.models.distortion import Distortion, Identified, Interface, Seen, none
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
-from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, contradiction, draw, rollout_of
+from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, alternating, blank, contradiction, draw, rollout_of
 from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, challenger, expected, incumbent, update
 from sgft_jax.stacking import member, stack
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
 
+_CHANGES = 2  # how often the rollouts that count are halved
 MAKE = "`python -m experiments.estimate --prior PRIOR` makes it"
 
 
@@ -30,8 +31,8 @@ class Believed(NamedTuple):
     params: of the policy that plays in simulation, without an estimator. rollouts: [MOST] the last ones, and `count` []
     how many there have been. distortion: what is corrected by the choice in simulation. fit: the correction that fits
     real steps best. contradicted: [] bool, whether rollouts contradict each other more than those of the simulator's
-    systems do. promised: [3] the success that simulation promises for the policies of `trust`, nan for those that it
-    has not tried. key: of all choices.
+    systems do. changed: [] bool, whether the system is not what it was. promised: [3] the success that simulation
+    promises for the policies of `trust`, nan for those that it has not tried. key: of all choices.
     """
 
     params: PyTree
@@ -41,6 +42,7 @@ class Believed(NamedTuple):
     distortion: Distortion
     fit: Identified
     contradicted: Array
+    changed: Array
     promised: Array
     key: Key
 
@@ -49,14 +51,16 @@ class Inference(NamedTuple):
     """What rollouts say. distortion: the correction that does best in the systems that may have made them. promised:
     [2 + n] success there of the prior as it is, behind that, and behind each of n other corrections.
 
-    nats: [] by which halves of the rollouts contradict each other. contradicted: [] bool, whether that is more than in
-    95 % of the simulator's systems; of one rollout never.
+    nats: [] by which every other rollout contradicts those between. contradicted: [] bool, whether that is more than in
+    95 % of the simulator's systems; of one rollout never. current: [MOST] bool, the rollouts that count: all, or where
+    the system has changed, the later ones.
     """
 
     distortion: Distortion
     promised: Array
     nats: Array
     contradicted: Array
+    current: Array
 
 
 class Deployed(NamedTuple):
@@ -84,16 +88,36 @@ def infer(
 ) -> Inference:
     """What the first `count` [] of rollouts [MOST] say of a system, and which policy is best there.
 
-    params: of the policy that plays in simulation. others: corrections that are candidates beside those of the
-    posterior.
+    params: of the policy that plays in simulation. rollouts: of which later ones replace the first. others: corrections
+    that are candidates beside those of the posterior.
     """
     counts, d = jnp.arange(MOST) < count, len(systems.unknowns)
-    key_points, key_choice, key_halves = jax.random.split(key, 3)
-    points = draw(estimator, rollouts, counts, d, key_points, CANDIDATES + JUDGES)
+    key_points, key_choice, key_halves, key_change = jax.random.split(key, 4)
+    nats = contradiction(estimator, rollouts, alternating(counts), d, key_halves)
+    contradicted = _too_much(estimator, counts, nats)
+    age = (count - 1 - jnp.arange(MOST)) % MOST
+    current = jnp.where(contradicted, counts, _current(estimator, rollouts, counts, age, d, key_change))
+    points = draw(estimator, rollouts, current, d, key_points, CANDIDATES + JUDGES)
     distortion, promised = choose(env, systems, policy, params, points, key_choice, *others)
-    nats = contradiction(estimator, rollouts, counts, d, key_halves)
-    usual = estimator.usual[jnp.minimum(count, MOST) - 1]
-    return Inference(distortion, promised, nats, (count > 1) & (nats > usual))
+    return Inference(distortion, promised, nats, contradicted, current)
+
+
+def _current(estimator: Estimator, rollouts: Rollout, counts: Array, age: Array, d: int, key: Key) -> Array:
+    """[MOST] bool, the rollouts of a system as it is now: its later half as long as that contradicts the earlier one.
+
+    age: [MOST] rollouts since each. Rollouts of one system have no order, so what is usual of other halves is of these.
+    """
+    for key_half in jax.random.split(key, _CHANGES):
+        late = counts & (age < (counts.sum() + 1) // 2)
+        nats = contradiction(estimator, rollouts, (counts & ~late, late), d, key_half)
+        counts = jnp.where(_too_much(estimator, counts, nats), late, counts)
+    return counts
+
+
+def _too_much(estimator: Estimator, counts: Array, nats: Array) -> Array:
+    """[] bool, whether 95 % of the simulator's systems contradict themselves less than that."""
+    n = counts.sum()
+    return (n > 1) & (nats > estimator.usual[jnp.maximum(n, 1) - 1])
 
 
 def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: Interface) -> Interface:
@@ -114,6 +138,7 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: 
             distortion=nothing,
             fit=fitting.start(params, key),
             contradicted=jnp.zeros((), bool),
+            changed=jnp.zeros((), bool),
             promised=jnp.full(len(POLICIES), jnp.nan, jnp.float32),
             key=key,
         )
@@ -136,6 +161,7 @@ def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: 
             distortion=inference.distortion,
             fit=fit,
             contradicted=inference.contradicted,
+            changed=inference.current.sum() < jnp.minimum(count, MOST),
             promised=inference.promised.at[FITTED].set(fitted),
         )
 
@@ -148,7 +174,8 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
 
     inner: identifies by `posterior_interface`; its exported params act by `policy`. `learn` must follow each rollout
     once, as in `finetuning.finetune`. Metrics: posterior/deployed and posterior/tried, numbers of policies of `trust`;
-    the success that is expected of each; posterior/contradicted, 1 where no system of the simulator is the real one.
+    the success that is expected of each; posterior/contradicted, 1 where no system of the simulator is the real one;
+    posterior/changed, 1 where earlier rollouts are of another system.
     """
 
     def init(params: PyTree, key: Key) -> Deployed:
@@ -196,7 +223,8 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         known = agent.interface
         successes = expected(state.trust, known.promised, known.contradicted)
         metrics |= {f"posterior/{name}": x for name, x in zip(POLICIES, successes, strict=True)}
-        facts = {"deployed": state.incumbent, "tried": state.challenger, "contradicted": known.contradicted}
+        facts = {"deployed": state.incumbent, "tried": state.challenger}
+        facts |= {"contradicted": known.contradicted, "changed": known.changed}
         metrics |= {f"posterior/{name}": x.astype(jnp.float32) for name, x in facts.items()}
         return state._replace(agent=agent), metrics
 

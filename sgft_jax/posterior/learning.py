@@ -16,6 +16,7 @@ from sgft_jax.posterior.estimator import (
     MOST,
     Estimator,
     Rollout,
+    alternating,
     contradiction,
     histograms,
     init,
@@ -122,7 +123,7 @@ def finish(estimator: Estimator, lessons: Lessons, key: Key) -> Estimator:
     right = estimator._replace(ranks=_ranks(estimator, lessons))
 
     def nats(row: tuple[Rollout, Key], counts: Array) -> Array:
-        return contradiction(right, row[0], counts, d, row[1])
+        return contradiction(right, row[0], alternating(counts), d, row[1])
 
     contradictions = _by_number(nats, (lessons.rollouts, jax.random.split(key, n)))
     return right._replace(usual=jnp.quantile(contradictions, _USUAL, axis=0))

@@ -154,7 +154,7 @@ def test_halves_of_two_systems_contradict_each_other(key, monkeypatch):
     even = jnp.where(jnp.arange(MOST) % 2 == 0, 0.2, 0.8)[:, None, None]
     for values, wanted in ((jnp.full_like(even, 0.5), 0.0), (even, 0.5 * 6.0**2)):
         alike = one._replace(measured=jnp.broadcast_to(values, one.measured.shape))
-        nats = estimator.contradiction(fresh(key), alike, counted(6), 1, key)
+        nats = estimator.contradiction(fresh(key), alike, estimator.alternating(counted(6)), 1, key)
         assert nats == pytest.approx(wanted, rel=0.1, abs=1e-4)
 
 

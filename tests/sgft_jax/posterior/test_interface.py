@@ -20,7 +20,8 @@ from sgft_jax.learners.sac import SACConfig
 from sgft_jax.methods import get_method
 from sgft_jax.models import distortion
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.posterior import estimator
+from sgft_jax.posterior import estimator, interface
+from sgft_jax.posterior.estimator import MOST
 from sgft_jax.posterior.interface import entry_of
 from sgft_jax.posterior.trust import AS_IS, CORRECTED, FITTED
 from sgft_jax.systems.simulated import Simulated
@@ -117,9 +118,42 @@ def test_what_fits_real_steps_is_tried_where_the_others_fail_and_deployed_once_i
     assert not fits or jax.tree.all(jax.tree.map(jnp.array_equal, fine.trial(after).distortion, undo))
     metrics = fine.learn(after, key, 1, simulated())[1]
     assert metrics["posterior/tried"] == after.challenger and metrics["posterior/deployed"] == AS_IS
-    assert metrics["posterior/contradicted"] in (0, 1)
+    assert metrics["posterior/contradicted"] in (0, 1) and metrics["posterior/changed"] in (0, 1)
     won = jax.jit(fine.observe)(after, rows(key, 20), jnp.ones(20, bool), jnp.float32(1))
     assert won.incumbent == after.challenger
+
+
+@pytest.mark.heavy
+@pytest.mark.parametrize(
+    ("starts", "count", "wanted"),
+    [
+        ([0.5] * 10, 10, range(10)),  # always the same system
+        ([0.1, 0.9] * 5, 10, range(10)),  # never the same, but not one after another
+        ([0.1] * 6 + [0.9] * 4, 10, range(7, 10)),  # another one since the last four
+        ([0.1, 0.1, 0.1, 0.9, 0.9, 0.9, 0, 0, 0, 0], 6, range(3, 6)),
+        ([0.9] * 2 + [0.1] * 5 + [0.9] * 3, 12, [7, 8, 9, 0, 1]),  # the eleventh and twelfth replaced the first two
+        ([0.1] + [0.9] * 9, 1, [0]),
+    ],
+)
+def test_where_the_system_has_changed_later_rollouts_count(starts, count, wanted, monkeypatch):
+    """A posterior whose system is where rollouts start, within .1 of their mean, and none contradicts itself by 2."""
+
+    def mean(rollouts, counts):
+        return jnp.sum(rollouts.measured[:, 0, 0] * counts) / jnp.maximum(counts.sum(), 1)
+
+    def nats(known, rollouts, counts, point):
+        return -0.5 * ((point - mean(rollouts, counts)) / 0.1) ** 2
+
+    monkeypatch.setattr(estimator, "log_density", nats)
+    monkeypatch.setattr(
+        estimator, "draw", lambda known, rollouts, counts, d, key, n: jnp.full((n, 1), mean(rollouts, counts))
+    )
+    rollouts = estimator.blank(MOST, 20, 4, 2)
+    rollouts = rollouts._replace(measured=rollouts.measured + jnp.array(starts)[:, None, None])
+    known = small_estimator()._replace(usual=jnp.full(MOST, 2.0))
+    age = (count - 1 - jnp.arange(MOST)) % MOST
+    current = interface._current(known, rollouts, jnp.arange(MOST) < count, age, 1, jax.random.key(0))
+    assert jnp.flatnonzero(current).tolist() == sorted(wanted)
 
 
 def test_a_log_without_success_chooses_nothing():
