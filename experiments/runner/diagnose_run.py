@@ -15,9 +15,10 @@ from envs.base import Env
 from envs.gaps import Gap
 from envs.rollout import Episode
 from envs.types import Transition, UserError
+from experiments.runner import cli, options
 from experiments.runner.cli import columns
 from experiments.runner.gaps_run import systems
-from experiments.runner.narrowed import narrowed, posterior, readable, table
+from experiments.runner.narrowed import likely, narrowed, posterior, readable, table
 from experiments.runner.progress import doing
 from experiments.runner.real_systems import REMOTE, advice, connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
@@ -27,7 +28,7 @@ from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.reading import last_start
 from sgft_jax.diagnosis import Rollouts, honesty, promises
-from sgft_jax.files.disk import jsonable, write_json
+from sgft_jax.files.disk import jsonable, write_json, written
 from sgft_jax.io.priors import digest, load_priors, variant_of
 from sgft_jax.io.real import RealStore
 from sgft_jax.io.runs import read_config
@@ -114,7 +115,7 @@ def _infer(env: Env, members: Sequence[Prior], real: Sequence[Rollouts], seed: i
     with doing("building systems that it may be", 10, once=True):
         possible = candidates(env)
     judge = jax.jit(functools.partial(infer, env, possible, make_policy(members[0].card, env)))
-    with doing("trying corrections in these systems", 60 * len(members), once=True):
+    with doing("trying corrections in these systems", 40 + 15 * len(members), once=True):
         points = [posterior(env, prior, x, counts, key) for prior, x in zip(members, real, strict=True)]
         inferences = [
             judge(without_estimator(prior.params), prior.params.estimator, readable(env, x), jnp.int32(n), key)
@@ -154,6 +155,13 @@ def _said(
     picture = figures.shrinking(home / "posterior.png", *known, inferred.counts, title="Which system is it?")
     heading = ["", "Which system is it? 80 % intervals of what rollouts tell most of:", ""]
     lines = [_misfit(looks), *heading, table(known, inferred.counts), "", f"picture: {picture}"]
+    if not any(look["contradiction"]["contradicted"] for look in looks):
+        path = home / "system.toml"
+        with written(path) as part:
+            part.write_text(gaps.to_toml([likely(env, np.concatenate(inferred.inference.points))]), encoding="utf-8")
+        preset = "cpu" if jax.default_backend() == "cpu" else None
+        train = options.command("pretrain", task=env.name, preset=preset, real=path)
+        lines.append(cli.as_typed(f"these systems: {path}; a policy for them: {train}"))
     return lines, {"unknowns": {"after": inferred.counts, **known._asdict()}}
 
 
@@ -288,5 +296,6 @@ def _misfit(looks: Sequence[Mapping[str, Any]]) -> str:
     if contradicted >= 0.5:
         return f"None of the simulator's systems made these rollouts: {numbers}. Neither intervals nor promises hold."
     if (current := min(look["current"] for look in looks)) < min(looks[0]["rollouts"], MOST):
-        return f"The system changes: earlier rollouts contradict later ones. Promises are of the last {current}, intervals of all."
+        later = f"Promises are of the last {current}, intervals of all."
+        return f"The system changes: earlier rollouts contradict later ones. {later}"
     return f"One of the simulator's systems may have made these rollouts: {numbers}. Warps can stay unseen."

@@ -10,9 +10,11 @@ import numpy as np
 
 from envs import gaps
 from envs.base import Env, World
+from envs.domains import parameter_ranges
+from envs.effects import make_range
 from envs.gaps import Gap
 from envs.rollout import real_env
-from envs.types import Array, Key
+from envs.types import Array, Key, UserError
 from sgft_jax.analysis import tables
 from sgft_jax.diagnosis import Rollouts
 from sgft_jax.posterior.candidates import Unknown, unknowns_of, values
@@ -22,6 +24,7 @@ from sgft_jax.types import Prior
 
 _DRAWS = 1000  # points of a posterior that say how wide it is
 _SHOWN = 6
+_TAILS = (0.025, 0.1, 0.2, 0.3, 0.4, 0.5)  # shares outside of a box, to either side
 _WORDS = {
     "action_scale": "scale of",
     "action_bias": "bias of",
@@ -77,6 +80,36 @@ def narrowed(env: Env, points: np.ndarray, gap: Gap | None) -> Narrowed:
         pool = gaps.worlds(real_env(env, [gap]), gap, jax.random.key(0), 1)
         known = scale * truth(env, member(pool, 0), [unknowns[i] for i in best])
     return Narrowed([name for name, _ in labels], scale[:, None] * bounds, known)
+
+
+def likely(env: Env, points: np.ndarray) -> Gap:
+    """A box of systems around points [n, d], as a gap in which one can train: 95 % of each number, or less where some
+    corner of that is impossible, as a peg wider than its hole.
+    """
+    unknowns = unknowns_of(env)
+    numbers = np.asarray(jax.vmap(functools.partial(values, unknowns))(jnp.asarray(points)))
+    boxes = (np.quantile(numbers, [tail, 1.0 - tail], axis=0) for tail in _TAILS)
+    possible = (gap for gap in (_box(env, unknowns, *box) for box in boxes) if _is_possible(env, gap))
+    return next(possible)
+
+
+def _box(env: Env, unknowns: Sequence[Unknown], low: np.ndarray, high: np.ndarray) -> Gap:
+    """Every unknown within low and high [d], vectors filled with what has no effect."""
+    nothing = {name: np.asarray(x, np.float64) for name, x in make_range(env, {}).low._asdict().items()}
+    ends = {u.name: np.stack([nothing.get(u.name, np.zeros(()))] * 2) for u in unknowns}
+    for unknown, *pair in zip(unknowns, low, high, strict=True):
+        place = (slice(None), unknown.index) if ends[unknown.name].ndim > 1 else slice(None)
+        ends[unknown.name][place] = [float(f"{x:.4g}") for x in pair]
+    effects = {name: pair.tolist() for name, pair in ends.items() if name in nothing}
+    return Gap("system", {name: pair.tolist() for name, pair in ends.items() if name not in nothing}, effects)
+
+
+def _is_possible(env: Env, gap: Gap) -> bool:
+    try:
+        parameter_ranges(env, gap.params)
+    except UserError:
+        return False
+    return True
 
 
 def table(known: Narrowed, counts: Sequence[int]) -> str:

@@ -48,14 +48,16 @@ class Believed(NamedTuple):
 
 
 class Inference(NamedTuple):
-    """What rollouts say. distortion: the correction that does best in the systems that may have made them. promised:
-    [2 + n] success there of the prior as it is, behind that, and behind each of n other corrections.
+    """What rollouts say. points: [CANDIDATES + JUDGES, d] systems that may have made them. distortion: the correction
+    that does best there. promised: [2 + n] success there of the prior as it is, behind that, and behind each of n other
+    corrections.
 
     nats: [] by which every other rollout contradicts those between. contradicted: [] bool, whether that is more than in
     95 % of the simulator's systems; of one rollout never. current: [MOST] bool, the rollouts that count: all, or where
     the system has changed, the later ones.
     """
 
+    points: Array
     distortion: Distortion
     promised: Array
     nats: Array
@@ -99,7 +101,7 @@ def infer(
     current = jnp.where(contradicted, counts, _current(estimator, rollouts, counts, age, d, key_change))
     points = draw(estimator, rollouts, current, d, key_points, CANDIDATES + JUDGES)
     distortion, promised = choose(env, systems, policy, params, points, key_choice, *others)
-    return Inference(distortion, promised, nats, contradicted, current)
+    return Inference(points, distortion, promised, nats, contradicted, current)
 
 
 def _current(estimator: Estimator, rollouts: Rollout, counts: Array, age: Array, d: int, key: Key) -> Array:
