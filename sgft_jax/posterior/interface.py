@@ -17,7 +17,18 @@ from sgft_jax.models.distortion import Distortion, Identified, Interface, Seen, 
 from sgft_jax.posterior.candidates import Candidates, unknowns_of
 from sgft_jax.posterior.decision import CANDIDATES, JUDGES, choose
 from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, alternating, blank, contradiction, draw, rollout_of
-from sgft_jax.posterior.trust import AS_IS, FITTED, POLICIES, Trust, begin, challenger, expected, incumbent, update
+from sgft_jax.posterior.trust import (
+    AS_IS,
+    FITTED,
+    POLICIES,
+    Trust,
+    begin,
+    challenger,
+    expected,
+    faded,
+    incumbent,
+    update,
+)
 from sgft_jax.stacking import member, stack
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
 
@@ -207,8 +218,8 @@ def deployed(inner: Finetuner, policy: Policy) -> Finetuner:
         agent = inner.observe(state.agent, rows, valid, score)
         if score is None:  # none of the policies has played
             return state._replace(agent=agent)
-        trust = update(state.trust, state.challenger, state.agent.interface.promised, score > 0.5)
-        known = agent.interface
+        known, promised = agent.interface, state.agent.interface.promised
+        trust = update(faded(state.trust, known.changed), state.challenger, promised, score > 0.5)
         which = (rule(trust, known.promised, known.contradicted) for rule in (challenger, incumbent))
         return Deployed(agent, state.first, trust, *which)
 

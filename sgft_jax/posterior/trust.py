@@ -60,6 +60,12 @@ def update(trust: Trust, deployed: Array, promised: Array, success: Array) -> Tr
     return Trust(trust.log_odds + gain, trust.won + row * success, trust.lost + row * ~success)
 
 
+def faded(trust: Trust, changed: Array) -> Trust:
+    """After a change of the system, what policies did before counts half. changed: [] bool."""
+    share = jnp.where(changed, 0.5, 1.0)
+    return trust._replace(won=share * trust.won, lost=share * trust.lost)
+
+
 def expected(trust: Trust, promised: Array, contradicted: Array | bool = False) -> Array:
     """[3] the success to expect of the policies. promised: [3] by the simulator, nan where it has not tried one.
     contradicted: [] bool, whether no system of the simulator makes rollouts as they were.
