@@ -4,11 +4,13 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
+from envs import extend
 from envs.types import UserError
 from experiments.runner import cli, options
 from experiments.runner.cli import Json
 from experiments.runner.options import Impl
 from experiments.runner.real_systems import check as check_real
+from experiments.runner.real_systems import title
 from sgft_jax.io.runs import check_folder, read_config
 from sgft_jax.presets import DEFAULT_PRESET
 
@@ -39,12 +41,23 @@ class DiagnoseArgs:
     impl: Impl = "auto"
 
 
+_FILES = ("diagnosis.json", "posterior.png")
+
+
+def folder_of(args: DiagnoseArgs, task: str, recorded: Path | None) -> Path:
+    """Where picture and numbers go."""
+    name = title(args.real)
+    if recorded is not None:
+        name = "_".join(recorded.parts[-3:] if read_config(recorded) else recorded.parts[-1:])
+    return args.out / "diagnose" / extend.name_of(task) / name
+
+
 def main(args: DiagnoseArgs) -> None:
     """Diagnoses and prints."""
     checked = check(args)
     from experiments.runner.diagnose_run import diagnose
 
-    summary, lines = diagnose(args, *checked)
+    summary, lines = diagnose(args, *checked, folder_of(args, *checked[1:]))
     print(json.dumps(summary) if args.json else "\n".join(lines))
 
 
@@ -70,6 +83,9 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     folders = options.prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
     task = options.task_of_priors(folders, task)
     check_real(task, [] if recorded else [args.real])
+    check_folder(home := folder_of(args, task, recorded))
+    if blocked := [home / name for name in _FILES if (home / name).is_dir()]:
+        raise UserError(f"{blocked[0]}: is a folder; move it away or choose another --out")
     return folders, task, recorded
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs.types import Array, Transition
@@ -21,13 +22,15 @@ class Rollouts(NamedTuple):
 
 def promises(value: Callable[[Array], Array], rollouts: Rollouts) -> tuple[Array, Array]:
     """V_sim [n, T] of visited states, and the discounted returns [n, T] that followed, V_sim standing for what comes
-    after the last step. value: V_sim of an observation.
+    after the last valid step. value: V_sim of an observation. Numbers of invalid steps mean nothing.
     """
 
-    def one(rows: Transition) -> tuple[Array, Array]:
-        return jax.vmap(value)(rows.obs), discounted_returns(rows.reward, rows.discount, value(rows.next_obs[-1]))
+    def one(rows: Transition, valid: Array) -> tuple[Array, Array]:
+        last = value(rows.next_obs[jnp.max(jnp.arange(len(valid)) * valid)])
+        reward, discount = jnp.where(valid, rows.reward, 0.0), jnp.where(valid, rows.discount, 1.0)
+        return jax.vmap(value)(rows.obs), discounted_returns(reward, discount, last)
 
-    return jax.vmap(one)(rollouts.transitions)
+    return jax.vmap(one)(rollouts.transitions, rollouts.valid)
 
 
 def honesty(values: np.ndarray, returns: np.ndarray, valid: np.ndarray) -> dict[str, float]:

@@ -38,6 +38,7 @@ from sgft_jax.posterior.candidates import candidates
 from sgft_jax.posterior.estimator import MOST, without_estimator
 from sgft_jax.posterior.interface import MAKE, Inference, check_estimator, infer
 from sgft_jax.posterior.trust import AS_IS, CORRECTED
+from sgft_jax.systems.simulated import drifted
 from sgft_jax.types import Prior
 
 if TYPE_CHECKING:
@@ -45,17 +46,17 @@ if TYPE_CHECKING:
 
 _PLAYED = 4  # rollouts of every prior on a gap, unless the user says otherwise
 _SEED = 2**31 + 7  # of all of them
+_RANGE = 1.001  # of commands, with room for rounding
 _READ = (*Transition._fields, "valid", "success")  # arrays of a recorded rollout
 
 
 class Evidence(NamedTuple):
-    """Rollouts [n] of every member, and which prior looks at each. name: of the folder. words: what was played where.
-    gap: the real system, where one knows.
+    """Rollouts [n] of every member, and which prior looks at each. words: what was played where. gap: the real system,
+    where one knows.
     """
 
     real: list[Rollouts]
     which: list[int]
-    name: str
     words: str
     gap: Gap | None = None
 
@@ -69,18 +70,16 @@ class Inferred(NamedTuple):
 
 
 def diagnose(
-    args: "DiagnoseArgs", folders: list[Path], task: str, recorded: Path | None
+    args: "DiagnoseArgs", folders: list[Path], task: str, recorded: Path | None, home: Path
 ) -> tuple[dict[str, Any], list[str]]:
-    """The diagnosis as JSON data and as lines for people; writes the numbers, and a picture where there is an
-    estimator.
+    """The diagnosis as JSON data and as lines for people. In `home` it leaves the numbers, and a picture where there is
+    an estimator.
     """
     env, priors = load(task, args.impl, folders)
-    home = args.out / "diagnose" / env.name
     seen = recorded_in(env, priors, recorded, args.rollouts) if recorded else _played(env, priors, args, home)
     members, labels = [priors[p] for p in seen.which], [str(folders[p]) for p in seen.which]
-    home /= seen.name
+    inferred = _infer(env, members, seen.real, args.seed) if priors[0].card.get("estimator") else None
     home.mkdir(parents=True, exist_ok=True)
-    inferred = _infer(env, members, seen.real, args.seed) if "estimator" in priors[0].card else None
     with doing("writing down what rollouts say", 10, once=True):
         looks = [_look(env, prior, rollouts) for prior, rollouts in zip(members, seen.real, strict=True)]
         said, told = _said(env, home, looks, members, inferred, seen.gap)
@@ -103,7 +102,7 @@ def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior
     priors = load_priors(folders, env, estimators=True)
     for prior in priors:
         api.check_prior(prior, get_method("sgft"), env)
-        if "estimator" in prior.card:
+        if prior.card.get("estimator"):
             check_estimator(prior.card, env)
     return env, priors
 
@@ -155,10 +154,12 @@ def _said(
     picture = figures.shrinking(home / "posterior.png", *known, inferred.counts, title="Which system is it?")
     heading = ["", "Which system is it? 80 % intervals of what rollouts tell most of:", ""]
     lines = [_misfit(looks), *heading, table(known, inferred.counts), "", f"picture: {picture}"]
+    path = home / f"like-{home.name}.toml"
+    path.unlink(missing_ok=True)  # of an earlier diagnosis
     if not any(look["contradiction"]["contradicted"] for look in looks):
-        path = home / "system.toml"
+        systems = likely(env, np.concatenate(inferred.inference.points), path.stem)
         with written(path) as part:
-            part.write_text(gaps.to_toml([likely(env, np.concatenate(inferred.inference.points))]), encoding="utf-8")
+            part.write_text(gaps.to_toml([systems]), encoding="utf-8")
         preset = "cpu" if jax.default_backend() == "cpu" else None
         train = options.command("pretrain", task=env.name, preset=preset, real=path)
         lines.append(cli.as_typed(f"these systems: {path}; a policy for them: {train}"))
@@ -170,32 +171,33 @@ def _said(
 
 def _played(env: Env, priors: list[Prior], args: "DiagnoseArgs", home: Path) -> Evidence:
     """Zero-shot rollouts of every prior, on a gap or a real system."""
-    count, name, gap = args.rollouts or _PLAYED, title(args.real), None
+    count, where, gap = args.rollouts or _PLAYED, title(args.real), None
     if is_stepped(args.real):
-        real, where = _play_real(env, args, priors, count, home / name), name
+        real = _play_real(env, args, priors, count, home)
     else:
-        gap, where = gaps.load(env, args.real), f"the gap {name}"
+        gap, where = gaps.load(env, args.real), f"the gap {where}"
         real = _play(env, gap, priors, count, args.seed)
     who = "one prior" if len(priors) == 1 else f"each of {len(priors)} priors"
-    return Evidence(
-        real, list(range(len(priors))), name, f"{_rollouts(count)} of {who}, just played zero-shot on {where}", gap
-    )
+    words = f"{_rollouts(count)} of {who}, just played zero-shot on {where}"
+    return Evidence(real, list(range(len(priors))), words, gap)
 
 
 def recorded_in(env: Env, priors: list[Prior], home: Path, most: int | None) -> Evidence:
     """Rollouts that a folder holds."""
     real, which = read(home, env, priors, most)
-    name = "_".join(home.parts[-3:] if read_config(home) else home.parts[-1:])
-    return Evidence(real, which, name, f"{_rollouts(real[0].valid.shape[0])} recorded in {home}")
+    return Evidence(real, which, f"{_rollouts(real[0].valid.shape[0])} recorded in {home}")
 
 
 def _play(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
-    """Rollouts [n] of every prior on a gap."""
-    key = jax.random.fold_in(jax.random.key(_SEED), seed)
+    """Rollouts [n] of every prior on a gap, whose sensors may drift from one to the next."""
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), seed), n)
     with doing(f"playing {_rollouts(n)} of each prior", 30, once=True):
         system, members = systems(env, [gap], priors, max(n, 64))
         policy = make_policy(priors[0].card, system.env)
-        return _of_members(play(system, policy, members, key, n), len(priors))
+        if system.drift is None:
+            return _of_members(play(system, policy, members, keys[0], n), len(priors))
+        played = [play(drifted(system, i), policy, members, key, 1) for i, key in enumerate(keys)]
+        return _of_members(jax.tree.map(lambda *x: np.concatenate(x, axis=1), *played), len(priors))
 
 
 def _play_real(env: Env, args: "DiagnoseArgs", priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
@@ -230,6 +232,8 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     stored = [store.rollout(i) for i in range(min(len(store), most or len(store)))]
     for i, arrays in enumerate(stored):
         _check(home / "real", i, arrays, stored[0], env)
+    if any(np.abs(arrays["action"][arrays["valid"].astype(bool)]).max(initial=0.0) > _RANGE for arrays in stored):
+        raise UserError(f"{home / 'real'}: holds actions beyond [-1, 1], the range of commands")
     joined = {name: jnp.stack([arrays[name] for arrays in stored], axis=1) for name in _READ}
     if not joined["valid"].any():
         raise UserError(f"{home / 'real'}: holds no valid step")

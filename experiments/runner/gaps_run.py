@@ -114,7 +114,8 @@ def systems(env: Env, reals: Sequence[Gap], priors: list[Prior], episodes: int) 
     pools = real_worlds(env, reals, jax.random.key(FINAL_SEED), episodes)
     which = jnp.repeat(jnp.arange(len(reals)), len(priors))
     members = stacking.stack([prior.params for prior in priors] * len(reals))
-    return Simulated(env, pools, which, gamma=priors[0].card["gamma"]), members
+    drift = gaps.drifts(env, reals)
+    return Simulated(env, pools, which, gamma=priors[0].card["gamma"], drift=drift), members
 
 
 def train(

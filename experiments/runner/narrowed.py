@@ -82,26 +82,27 @@ def narrowed(env: Env, points: np.ndarray, gap: Gap | None) -> Narrowed:
     return Narrowed([name for name, _ in labels], scale[:, None] * bounds, known)
 
 
-def likely(env: Env, points: np.ndarray) -> Gap:
+def likely(env: Env, points: np.ndarray, name: str) -> Gap:
     """A box of systems around points [n, d], as a gap in which one can train: 95 % of each number, or less where some
-    corner of that is impossible, as a peg wider than its hole.
+    corner of that is impossible, as a peg wider than its hole. name: of the gap.
     """
     unknowns = unknowns_of(env)
     numbers = np.asarray(jax.vmap(functools.partial(values, unknowns))(jnp.asarray(points)))
     boxes = (np.quantile(numbers, [tail, 1.0 - tail], axis=0) for tail in _TAILS)
-    possible = (gap for gap in (_box(env, unknowns, *box) for box in boxes) if _is_possible(env, gap))
+    possible = (gap for gap in (_box(env, unknowns, box[0], box[1], name) for box in boxes) if _is_possible(env, gap))
     return next(possible)
 
 
-def _box(env: Env, unknowns: Sequence[Unknown], low: np.ndarray, high: np.ndarray) -> Gap:
+def _box(env: Env, unknowns: Sequence[Unknown], low: np.ndarray, high: np.ndarray, name: str) -> Gap:
     """Every unknown within low and high [d], vectors filled with what has no effect."""
     nothing = {name: np.asarray(x, np.float64) for name, x in make_range(env, {}).low._asdict().items()}
     ends = {u.name: np.stack([nothing.get(u.name, np.zeros(()))] * 2) for u in unknowns}
     for unknown, *pair in zip(unknowns, low, high, strict=True):
         place = (slice(None), unknown.index) if ends[unknown.name].ndim > 1 else slice(None)
         ends[unknown.name][place] = [float(f"{x:.4g}") for x in pair]
-    effects = {name: pair.tolist() for name, pair in ends.items() if name in nothing}
-    return Gap("system", {name: pair.tolist() for name, pair in ends.items() if name not in nothing}, effects)
+    tables = {key: pair.tolist() for key, pair in ends.items()}
+    effects = {key: tables.pop(key) for key in nothing if key in tables}
+    return Gap(name, tables, effects)
 
 
 def _is_possible(env: Env, gap: Gap) -> bool:

@@ -61,8 +61,10 @@ def update(trust: Trust, deployed: Array, promised: Array, success: Array) -> Tr
 
 
 def faded(trust: Trust, changed: Array) -> Trust:
-    """After a change of the system, what policies did before counts half. changed: [] bool."""
-    share = jnp.where(changed, 0.5, 1.0)
+    """After a change of the system, what the prior as it is did before counts half; corrections follow the change.
+    changed: [] bool.
+    """
+    share = jnp.ones(3).at[AS_IS].set(jnp.where(changed, 0.5, 1.0))
     return trust._replace(won=share * trust.won, lost=share * trust.lost)
 
 

@@ -2,14 +2,17 @@ import json
 
 import numpy as np
 import pytest
+import toy
 from priors_by_hand import save_prior, save_with_estimator
 from runs_by_hand import save
 
+from envs import gaps
 from experiments import diagnose
-from experiments.runner import cli, narrowed
+from experiments.runner import cli, diagnose_run, narrowed
 from sgft_jax.io.real import RealStore
 from sgft_jax.posterior import decision, interface
 
+look = diagnose_run._look
 pytestmark = pytest.mark.usefixtures("toy_task")
 
 
@@ -24,11 +27,11 @@ def call(*argv):
     cli.run_main(diagnose.main, diagnose.DiagnoseArgs, "Diagnose.", argv=[str(a) for a in argv])
 
 
-def record(folder, *, policies=1, rollouts=4, success=(), obs_dim=4, steps=20, without=()):
+def record(folder, *, policies=1, rollouts=4, success=(), obs_dim=4, steps=20, without=(), push=1.0):
     """Rollouts of a point that is pushed about, as a robot records them; `success` tells those that had it."""
     rng, store = np.random.default_rng(0), RealStore(folder)
     for i in range(rollouts):
-        action = rng.uniform(-1, 1, (policies, steps, 2)).astype(np.float32)
+        action = rng.uniform(-push, push, (policies, steps, 2)).astype(np.float32)
         obs = np.cumsum(rng.normal(0, 0.1, (policies, steps + 1, obs_dim)), axis=1).astype(np.float32)
         arrays = {
             "obs": obs[:, :-1],
@@ -84,12 +87,31 @@ def test_an_estimator_says_which_system_it_may_be(usual, tmp_path, monkeypatch, 
         and one["promised"]["corrected"] >= one["promised"]["as it is"]
     )
 
+    trained = gaps.load(toy.make(), str(home / "like-turned.toml")) if usual > 0 else None
+    assert (home / "like-turned.toml").exists() == (usual > 0) and (
+        trained is None or "action_rotation" in trained.effects
+    )
+
     # From disk nobody knows what is true, and the same rollouts by two policies say as much.
     recorded = record(tmp_path / "robot", success=(1,))
     call("--prior", tmp_path / "prior", "--real", recorded, "--rollouts", 1, "--out", tmp_path / "runs", "--json")
     facts = json.loads(capsys.readouterr().out)
     assert facts["unknowns"]["truth"] is None and facts["unknowns"]["after"] == [0, 1]
     assert facts["priors"][0]["contradiction"]["contradicted"] is False
+
+
+@pytest.mark.slow
+def test_sensors_drift_from_rollout_to_rollout(priors, tmp_path, monkeypatch):
+    """The first measurement is off by ten more with each; starts differ by less than two."""
+    gap = tmp_path / "drifting.toml"
+    gap.write_text("[drift]\nxy = [10.0, 0.0]\n")
+    seen = []
+    monkeypatch.setattr(
+        diagnose_run, "_look", lambda env, prior, rollouts: seen.append(rollouts) or look(env, prior, rollouts)
+    )
+    call("--prior", priors, "--real", gap, "--rollouts", 3, "--out", tmp_path / "runs")
+    starts = np.asarray(seen[0].transitions.obs)[:, 0, 0]
+    np.testing.assert_allclose(np.diff(starts), [10.0, 10.0], atol=2.0)
 
 
 @pytest.mark.slow
@@ -142,6 +164,8 @@ def test_a_run_says_which_prior_each_seed_has(priors, tmp_path, capsys):
         ),
         (["--prior", "PRIOR", "--real", "torn"], "rollout-000000.npz: lacks valid"),
         (["--prior", "PRIOR", "--real", "three"], "holds rollouts of 3 policies"),
+        (["--prior", "PRIOR", "--real", "far"], "far/real: holds actions beyond [-1, 1]"),
+        (["--prior", "PRIOR", "--real", "sim", "--out", "full"], "diagnosis.json: is a folder; move it away"),
         (["--prior", "PRIOR", "--seed", "-1"], "--seed is -1: seeds go from 0 to 2147483647"),
     ],
 )
@@ -150,7 +174,9 @@ def test_a_bad_command_is_one_line_and_code_2(argv, words, priors, tmp_path, cap
     record(tmp_path / "wide", obs_dim=5)
     record(tmp_path / "torn", without=("valid",))
     record(tmp_path / "three", policies=3)
+    record(tmp_path / "far", push=5.0)
     (tmp_path / "empty").mkdir()
+    (tmp_path / "full/diagnose/toy/sim/diagnosis.json").mkdir(parents=True)
     with pytest.raises(SystemExit) as stopped:
         call(*[{"PRIOR": priors, "EMPTY": tmp_path / "empty"}.get(word, word) for word in argv])
     error = capsys.readouterr().err

@@ -27,7 +27,7 @@ def test_the_box_holds_most_systems_and_is_a_gap_that_can_be_read(tmp_path):
         named(env, object_mass=m, action_scale_1=s, obs_bias_3=b) for m, s, b in ((0.1, 0.6, 0.0), (0.2, 0.8, 0.004))
     )
     shares = np.linspace(0, 1, 101)[:, None]
-    gap = likely(env, low + shares * (high - low))
+    gap = likely(env, low + shares * (high - low), "like")
     assert gap.effects["action_scale"][0][1] == pytest.approx(0.605, abs=2e-3)
     assert gap.effects["action_scale"][1][1] == pytest.approx(0.795, abs=2e-3)
     assert gap.effects["obs_bias"][0][:3] == [0, 0, gap.effects["obs_bias"][1][2]], "what cannot err has no error"
@@ -42,7 +42,7 @@ def test_the_box_holds_most_systems_and_is_a_gap_that_can_be_read(tmp_path):
 def test_a_box_with_an_impossible_corner_is_made_smaller():
     env = compiled.make("insert")
     points = np.random.default_rng(0).uniform(size=(64, len(unknowns_of(env))))
-    gap = likely(env, points)
+    gap = likely(env, points, "like")
     assert gap.params["peg_radius"][1] < gap.params["hole_radius"][0]
     parameter_ranges(env, gap.params)
     assert gap.params["peg_radius"][0] < gap.params["peg_radius"][1], "and no smaller than it must be"

@@ -115,6 +115,15 @@ def test_rollouts_count_beside_a_promise():
     assert trust.expected(often, promised)[AS_IS] > trust.expected(once, promised)[AS_IS] + 0.05
 
 
+def test_a_prior_that_worked_before_the_system_changed_is_replaced_sooner():
+    promised = jnp.array([0.6, 0.95, jnp.nan])
+    known = after(*[(AS_IS, True)] * 6, (CORRECTED, True), promised=promised)
+    assert trust.challenger(known, promised) == AS_IS
+    for changed, wanted in ((False, AS_IS), (True, CORRECTED)):
+        later = trust.faded(trust.faded(known, jnp.array(changed)), jnp.array(changed))
+        assert trust.challenger(later, promised) == wanted and later.won[CORRECTED] == 1
+
+
 def test_without_a_promise_only_the_record_changes():
     known = after((AS_IS, True))
     assert known.log_odds == trust.begin().log_odds
