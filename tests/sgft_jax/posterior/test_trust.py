@@ -116,7 +116,7 @@ def test_rollouts_count_beside_a_promise():
 
 
 def test_a_prior_that_worked_before_the_system_changed_is_replaced_sooner():
-    promised = jnp.array([0.6, 0.95, jnp.nan])
+    promised = jnp.array([0.5, 0.95, jnp.nan])
     known = after(*[(AS_IS, True)] * 6, (CORRECTED, True), promised=promised)
     assert trust.challenger(known, promised) == AS_IS
     for changed, wanted in ((False, AS_IS), (True, CORRECTED)):
