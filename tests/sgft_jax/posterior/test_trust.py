@@ -116,12 +116,20 @@ def test_rollouts_count_beside_a_promise():
 
 
 def test_a_prior_that_worked_before_the_system_changed_is_replaced_sooner():
-    promised = jnp.array([0.5, 0.95, jnp.nan])
-    known = after(*[(AS_IS, True)] * 6, (CORRECTED, True), promised=promised)
+    known, promised = (
+        after(*[(AS_IS, True)] * 6, promised=jnp.array([0.95, 0.95, jnp.nan])),
+        jnp.array([0.4, 0.95, jnp.nan]),
+    )
     assert trust.challenger(known, promised) == AS_IS
     for changed, wanted in ((False, AS_IS), (True, CORRECTED)):
         later = trust.faded(trust.faded(known, jnp.array(changed)), jnp.array(changed))
-        assert trust.challenger(later, promised) == wanted and later.won[CORRECTED] == 1
+        assert trust.challenger(later, promised) == wanted
+
+
+def test_corrections_keep_their_record_when_the_system_changes():
+    known = after((AS_IS, True), (CORRECTED, True), (CORRECTED, False))
+    later = trust.faded(known, jnp.array(True))
+    assert later.won.tolist() == [0.5, 1, 0] and later.lost.tolist() == [0, 1, 0]
 
 
 def test_without_a_promise_only_the_record_changes():
