@@ -50,10 +50,10 @@ def main(args: DemoArgs) -> None:
 
     home = run_folder(run, args.real)
     with doing("drawing from the posterior", 10, once=True):
-        known, counts = narrowed_by(run, home)
-    path = figures.shrinking(home / "figures" / "posterior.png", *known, counts, title="Which system is it?")
+        known = narrowed_by(run, home)
+    path = figures.shrinking(home / "figures" / "posterior.png", *known, title="Which system is it?")
     print("\nWhich system is it? 80 % intervals of what rollouts tell most of:\n")
-    print(table(known, counts))
+    print(table(known))
     print("\nSuccess without exploration, before it promised by simulation:\n")
     print(tables.markdown(["rollouts", "deployed", "promised", "succeeds", "plays the next rollout"], outcome(home)))
     print(f"\nfigure: {path}\nother kinds of gap: docs/results.md")
@@ -74,20 +74,20 @@ def plan(args: DemoArgs) -> FinetuneArgs:
     return run
 
 
-def narrowed_by(run: FinetuneArgs, home: Path) -> tuple["Narrowed", list[int]]:
-    """What the rollouts of a run of `posterior` tell of its real system, after so many of them."""
+def narrowed_by(run: FinetuneArgs, home: Path) -> "Narrowed":
+    """What the rollouts of a run of `posterior` tell of its real system."""
     import jax
 
     from envs import gaps
     from experiments.runner.diagnose_run import load, recorded_in
-    from experiments.runner.narrowed import narrowed, posterior
+    from experiments.runner.narrowed import narrowed, posterior, readable
     from sgft_jax.posterior.estimator import MOST
 
     env, priors = load(run.task, run.impl, priors_of(run))
     seen, key = recorded_in(env, priors, home, None), jax.random.key(run.seed)
-    counts = list(range(min(len(seen.real[0].success), MOST) + 1))
-    points = posterior(env, priors[seen.which[0]], seen.real[0], counts, key)
-    return narrowed(env, points, gaps.load(env, run.real[0])), counts
+    estimator, after = priors[seen.which[0]].params.estimator, range(min(len(seen.real[0].success), MOST) + 1)
+    points = posterior(env, estimator, readable(env, seen.real[0]), after, key)
+    return narrowed(env, points, after, gaps.load(env, run.real[0]))
 
 
 def outcome(home: Path) -> list[list[str]]:

@@ -41,9 +41,6 @@ class DiagnoseArgs:
     impl: Impl = "auto"
 
 
-_FILES = ("diagnosis.json", "posterior.png")
-
-
 def folder_of(args: DiagnoseArgs, task: str, recorded: Path | None) -> Path:
     """Where picture and numbers go."""
     name = title(args.real)
@@ -84,7 +81,7 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     task = options.task_of_priors(folders, task)
     check_real(task, [] if recorded else [args.real])
     check_folder(home := folder_of(args, task, recorded))
-    if blocked := [home / name for name in _FILES if (home / name).is_dir()]:
+    if blocked := [path for path in home.glob("*.*") if path.is_dir()]:  # files go there, and the folder real/
         raise UserError(f"{blocked[0]}: is a folder; move it away or choose another --out")
     return folders, task, recorded
 

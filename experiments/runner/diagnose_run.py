@@ -18,7 +18,7 @@ from envs.types import Transition, UserError
 from experiments.runner import cli, options
 from experiments.runner.cli import columns
 from experiments.runner.gaps_run import systems
-from experiments.runner.narrowed import likely, narrowed, posterior, readable, table
+from experiments.runner.narrowed import Narrowed, likely, narrowed, posterior, readable, table
 from experiments.runner.progress import doing
 from experiments.runner.real_systems import REMOTE, advice, connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 _PLAYED = 4  # rollouts of every prior on a gap, unless the user says otherwise
 _SEED = 2**31 + 7  # of all of them
 _RANGE = 1.001  # of commands, with room for rounding
+_PICTURE = "posterior.png"
 _READ = (*Transition._fields, "valid", "success")  # arrays of a recorded rollout
 
 
@@ -62,9 +63,9 @@ class Evidence(NamedTuple):
 
 
 class Inferred(NamedTuple):
-    """points: [counts, draws, d] of the posteriors of all members after so many rollouts. inference: [M] after all."""
+    """points: [n, draws, d] of all members' posteriors, `after` so many rollouts [n]. inference: [M] after all."""
 
-    counts: list[int]
+    after: list[int]
     points: np.ndarray
     inference: Inference
 
@@ -80,13 +81,22 @@ def diagnose(
     members, labels = [priors[p] for p in seen.which], [str(folders[p]) for p in seen.which]
     inferred = _infer(env, members, seen.real, args.seed) if priors[0].card.get("estimator") else None
     home.mkdir(parents=True, exist_ok=True)
+    for name in (_PICTURE, _systems(home)):
+        (home / name).unlink(missing_ok=True)  # of an earlier diagnosis
+    facts: dict[str, Any] = {"task": env.name, "data": seen.words}
     with doing("writing down what rollouts say", 10, once=True):
         looks = [_look(env, prior, rollouts) for prior, rollouts in zip(members, seen.real, strict=True)]
-        said, told = _said(env, home, looks, members, inferred, seen.gap)
-    facts = {"task": env.name, "data": seen.words, **told}
+        if inferred is None:
+            lines = ["Which system it is stays open: no estimator" + f"; {MAKE}" * (env.score == "success"), ""]
+        else:
+            promised = [_promise(stacking.member(inferred.inference, i)) for i in range(len(members))]
+            looks = [look | promise for look, promise in zip(looks, promised, strict=True)]
+            known = narrowed(env, inferred.points, inferred.after, seen.gap)
+            lines = [_misfit(looks), *_draw(known, home), *_leave_systems(env, home, inferred.inference)]
+            facts["unknowns"] = known._asdict()
     facts = jsonable(facts | {"priors": [{"prior": label, **look} for label, look in zip(labels, looks, strict=True)]})
     write_json(home / "diagnosis.json", facts)
-    lines = [f"{env.name}: {seen.words}", *_rows(labels, looks), "", *said, f"numbers: {home / 'diagnosis.json'}"]
+    lines = [f"{env.name}: {seen.words}", *_rows(labels, looks), "", *lines, f"numbers: {home / 'diagnosis.json'}"]
     if env.score == "success" and not (recorded and read_config(recorded)):  # in a run others have played, too
         success = np.concatenate([x.success for x in {id(x): x for x in seen.real}.values()])  # each policy's once
         real, chosen = REMOTE if recorded else args.real, {"task": task, "prior": args.prior or folders[0].parent}
@@ -110,17 +120,18 @@ def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior
 def _infer(env: Env, members: Sequence[Prior], real: Sequence[Rollouts], seed: int) -> Inferred:
     """What the rollouts of every member say, by its prior's estimator, and what it promises of corrections."""
     n, key = min(real[0].valid.shape[0], MOST), jax.random.fold_in(jax.random.key(_SEED), seed)
-    counts = sorted({0, *(2**i for i in range(n.bit_length())), n})
+    after = sorted({0, *(2**i for i in range(n.bit_length())), n})
+    read = [readable(env, rollouts) for rollouts in real]
     with doing("building systems that it may be", 10, once=True):
         possible = candidates(env)
     judge = jax.jit(functools.partial(infer, env, possible, make_policy(members[0].card, env)))
     with doing("trying corrections in these systems", 40 + 15 * len(members), once=True):
-        points = [posterior(env, prior, x, counts, key) for prior, x in zip(members, real, strict=True)]
+        points = [posterior(env, prior.params.estimator, x, after, key) for prior, x in zip(members, read, strict=True)]
         inferences = [
-            judge(without_estimator(prior.params), prior.params.estimator, readable(env, x), jnp.int32(n), key)
-            for prior, x in zip(members, real, strict=True)
+            judge(without_estimator(prior.params), prior.params.estimator, x, jnp.int32(n), key)
+            for prior, x in zip(members, read, strict=True)
         ]
-        return Inferred(counts, np.concatenate(points, axis=1), jax.device_get(stacking.stack(inferences)))
+        return Inferred(after, np.concatenate(points, axis=1), jax.device_get(stacking.stack(inferences)))
 
 
 def _look(env: Env, prior: Prior, rollouts: Rollouts) -> dict[str, Any]:
@@ -133,37 +144,36 @@ def _look(env: Env, prior: Prior, rollouts: Rollouts) -> dict[str, Any]:
     return {"rollouts": len(success), "succeeded": int(success.sum()), "V_sim": honest}
 
 
-def _said(
-    env: Env,
-    home: Path,
-    looks: Sequence[dict[str, Any]],
-    members: Sequence[Prior],
-    inferred: Inferred | None,
-    gap: Gap | None,
-) -> tuple[list[str], dict[str, Any]]:
-    """Which system it may be, as lines and as JSON data. Draws the picture, and adds to `looks` what is promised."""
-    if inferred is None:
-        return ["Which system it is stays open: no estimator" + f"; {MAKE}" * (env.score == "success"), ""], {}
-    for i, (look, prior) in enumerate(zip(looks, members, strict=True)):
-        one, usual = stacking.member(inferred.inference, i), prior.params.estimator.usual
-        look["promised"] = {"as it is": one.promised[AS_IS], "corrected": one.promised[CORRECTED]}
-        nats = {"nats": one.nats, "usual": usual[min(look["rollouts"], MOST) - 1]}
-        look["contradiction"] = {**nats, "contradicted": one.contradicted}
-        look["current"] = int(one.current.sum())
-    known = narrowed(env, inferred.points, gap)
-    picture = figures.shrinking(home / "posterior.png", *known, inferred.counts, title="Which system is it?")
-    heading = ["", "Which system is it? 80 % intervals of what rollouts tell most of:", ""]
-    lines = [_misfit(looks), *heading, table(known, inferred.counts), "", f"picture: {picture}"]
-    path = home / f"like-{home.name}.toml"
-    path.unlink(missing_ok=True)  # of an earlier diagnosis
-    if not any(look["contradiction"]["contradicted"] for look in looks):
-        systems = likely(env, np.concatenate(inferred.inference.points), path.stem)
-        with written(path) as part:
-            part.write_text(gaps.to_toml([systems]), encoding="utf-8")
-        preset = "cpu" if jax.default_backend() == "cpu" else None
-        train = options.command("pretrain", task=env.name, preset=preset, real=path)
-        lines.append(cli.as_typed(f"these systems: {path}; a policy for them: {train}"))
-    return lines, {"unknowns": {"after": inferred.counts, **known._asdict()}}
+def _promise(inference: Inference) -> dict[str, Any]:
+    """What the rollouts of one member say of the system, as JSON data."""
+    promised = {"as it is": inference.promised[AS_IS], "corrected": inference.promised[CORRECTED]}
+    contradiction = {"nats": inference.nats, "usual": inference.usual, "contradicted": inference.contradicted}
+    return {"promised": promised, "contradiction": contradiction, "current": int(inference.current.sum())}
+
+
+def _draw(known: Narrowed, home: Path) -> list[str]:
+    """The picture of what is known, and the same as lines."""
+    picture = figures.shrinking(home / _PICTURE, *known, title="Which system is it?")
+    heading = "Which system is it? 80 % intervals of what rollouts tell most of:"
+    return ["", heading, "", table(known), "", f"picture: {picture}"]
+
+
+def _systems(home: Path) -> str:
+    """What the file there is called that holds these systems. Pretraining calls its own folder like it."""
+    return f"like-{home.name}.toml"
+
+
+def _leave_systems(env: Env, home: Path, inference: Inference) -> list[str]:
+    """Leaves the systems that may be the real one as a gap, unless some member's rollouts [M] are of none."""
+    path = home / _systems(home)
+    if inference.contradicted.any():
+        return []
+    with written(path) as part:
+        gap = likely(env, np.concatenate(inference.points), path.stem)
+        part.write_text(gaps.to_toml([gap]), encoding="utf-8")
+    preset = "cpu" if jax.default_backend() == "cpu" else None
+    train = options.command("pretrain", task=env.name, preset=preset, real=path)
+    return [cli.as_typed(f"these systems: {path}; a policy for them: {train}")]
 
 
 # --- rollouts ---------------------------------------------------------------------------------------------------------
@@ -178,20 +188,20 @@ def _played(env: Env, priors: list[Prior], args: "DiagnoseArgs", home: Path) -> 
         gap, where = gaps.load(env, args.real), f"the gap {where}"
         real = _play(env, gap, priors, count, args.seed)
     who = "one prior" if len(priors) == 1 else f"each of {len(priors)} priors"
-    words = f"{_rollouts(count)} of {who}, just played zero-shot on {where}"
+    words = f"{tables.rollouts(count)} of {who}, just played zero-shot on {where}"
     return Evidence(real, list(range(len(priors))), words, gap)
 
 
 def recorded_in(env: Env, priors: list[Prior], home: Path, most: int | None) -> Evidence:
     """Rollouts that a folder holds."""
     real, which = read(home, env, priors, most)
-    return Evidence(real, which, f"{_rollouts(real[0].valid.shape[0])} recorded in {home}")
+    return Evidence(real, which, f"{tables.rollouts(real[0].valid.shape[0])} recorded in {home}")
 
 
 def _play(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
     """Rollouts [n] of every prior on a gap, whose sensors may drift from one to the next."""
     keys = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), seed), n)
-    with doing(f"playing {_rollouts(n)} of each prior", 30, once=True):
+    with doing(f"playing {tables.rollouts(n)} of each prior", 30, once=True):
         system, members = systems(env, [gap], priors, max(n, 64))
         policy = make_policy(priors[0].card, system.env)
         if system.drift is None:
@@ -209,7 +219,7 @@ def _play_real(env: Env, args: "DiagnoseArgs", priors: list[Prior], n: int, home
         members = stacking.stack([prior.params for prior in priors])
         rhythm = 1 if is_robot(args.real) else None
         kept = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=rhythm)
-        with doing(f"playing {_rollouts(n)} of each prior"):
+        with doing(f"playing {tables.rollouts(n)} of each prior"):
             played = play(kept, make_policy(priors[0].card, env), members, key, n)
     finally:
         system.close()
@@ -271,10 +281,6 @@ def _check(
 
 
 # --- for people -------------------------------------------------------------------------------------------------------
-
-
-def _rollouts(n: int) -> str:
-    return f"{n} rollout{'s' * (n > 1)}"
 
 
 def _rows(labels: Sequence[str], looks: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -20,7 +20,6 @@ from sgft_jax.diagnosis import Rollouts
 from sgft_jax.posterior.candidates import Unknown, unknowns_of, values
 from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.stacking import member
-from sgft_jax.types import Prior
 
 _DRAWS = 1000  # points of a posterior that say how wide it is
 _SHOWN = 6
@@ -34,10 +33,12 @@ _WORDS = {
 
 
 class Narrowed(NamedTuple):
-    """The unknowns [k] that rollouts tell most of. names: with units. intervals: [n, k, 2], 80 % of the posterior after
-    each number of rollouts; sensor errors of lengths in mm. truth: [k], None where nobody knows it.
+    """The unknowns [k] that rollouts tell most of. after: [n] numbers of rollouts. names: with units. intervals:
+    [n, k, 2], 80 % of the posterior after each of these numbers; sensor errors of lengths in mm. truth: [k], None where
+    nobody knows it.
     """
 
+    after: Sequence[int]
     names: list[str]
     intervals: np.ndarray
     truth: np.ndarray | None
@@ -52,22 +53,24 @@ def readable(env: Env, rollouts: Rollouts) -> Rollout:
     return jax.tree.map(lambda room, x: room.at[tuple(map(slice, x.shape))].set(x), room, read)
 
 
-def posterior(env: Env, prior: Prior, rollouts: Rollouts, counts: Sequence[int], key: Key) -> np.ndarray:
-    """[len(counts), draws, d] points that the first so many rollouts allow, by the prior's estimator; before any, those
-    of the prior over unknowns.
+def posterior(env: Env, estimator: Estimator, rollouts: Rollout, after: Sequence[int], key: Key) -> np.ndarray:
+    """[n, draws, d] points that the first of rollouts [MOST] allow, `after` so many [n]; before any, those of the prior
+    over unknowns.
     """
     d = len(unknowns_of(env))
-
-    @jax.jit
-    def after(estimator: Estimator, read: Rollout, count: Array) -> Array:
-        return draw(estimator, read, jnp.arange(MOST) < count, d, key, _DRAWS)
-
-    read, before = readable(env, rollouts), jax.random.uniform(key, (_DRAWS, d))
-    return np.stack([after(prior.params.estimator, read, jnp.int32(n)) if n else before for n in counts])
+    before = jax.random.uniform(key, (_DRAWS, d))
+    return np.stack([_drawn(estimator, rollouts, jnp.int32(n), key, d) if n else before for n in after])
 
 
-def narrowed(env: Env, points: np.ndarray, gap: Gap | None) -> Narrowed:
-    """Of points [n, draws, d] after ever more rollouts, the first before any. gap: the real system, where one knows."""
+@functools.partial(jax.jit, static_argnames="d")
+def _drawn(estimator: Estimator, rollouts: Rollout, count: Array, key: Key, d: int) -> Array:
+    return draw(estimator, rollouts, jnp.arange(MOST) < count, d, key, _DRAWS)
+
+
+def narrowed(env: Env, points: np.ndarray, after: Sequence[int], gap: Gap | None) -> Narrowed:
+    """Of points [n, draws, d] `after` ever more rollouts [n], the first before any. gap: the real system, where one
+    knows.
+    """
     unknowns = unknowns_of(env)
     numbers = np.asarray(jax.jit(jax.vmap(jax.vmap(functools.partial(values, unknowns))))(points))
     std = points.std(axis=1)
@@ -79,7 +82,7 @@ def narrowed(env: Env, points: np.ndarray, gap: Gap | None) -> Narrowed:
     if gap is not None and not gap.scene:  # another scene has other parameters
         pool = gaps.worlds(real_env(env, [gap]), gap, jax.random.key(0), 1)
         known = scale * truth(env, member(pool, 0), [unknowns[i] for i in best])
-    return Narrowed([name for name, _ in labels], scale[:, None] * bounds, known)
+    return Narrowed(after, [name for name, _ in labels], scale[:, None] * bounds, known)
 
 
 def likely(env: Env, points: np.ndarray, name: str) -> Gap:
@@ -113,9 +116,9 @@ def _is_possible(env: Env, gap: Gap) -> bool:
     return True
 
 
-def table(known: Narrowed, counts: Sequence[int]) -> str:
+def table(known: Narrowed) -> str:
     """Intervals after so many rollouts, and the truth where it is known, in Markdown."""
-    head = ["", *(f"{n} rollout{'s' * (n != 1)}" for n in counts)]
+    head = ["", *map(tables.rollouts, known.after)]
     rows = [
         [name, *(f"{low:.3g} to {high:.3g}" for low, high in known.intervals[:, i])]
         for i, name in enumerate(known.names)

@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike
 
+from sgft_jax.analysis import tables
 from sgft_jax.analysis.curves import Curve, by_prior, spread
 from sgft_jax.math.stats import ENOUGH, Interval, iqm
 
@@ -248,16 +249,16 @@ def effects(path: Path, intervals: Mapping[str, Mapping[str, Mapping[str, Interv
 
 def shrinking(
     path: Path,
+    after: Sequence[int],
     names: Sequence[str],
     intervals: np.ndarray,
     truth: np.ndarray | None,
-    counts: Sequence[int],
     *,
     title: str,
 ) -> Path:
     """How intervals shrink around the truth: a panel for each unknown, a bar for each number of rollouts.
 
-    intervals: [n, k, 2] after `counts` [n] rollouts, the first before any. truth: [k], None where nobody knows it.
+    intervals: [n, k, 2] `after` so many rollouts [n], the first before any. truth: [k], None where nobody knows it.
     """
     columns = min(len(names), 3)
     figure, panels = _figure(3.4 * columns, 1.6 * math.ceil(len(names) / columns) + 0.6, columns, len(names))
@@ -266,7 +267,7 @@ def shrinking(
         axes.hlines(heights, *intervals[:, i].T, color=[_FAINT, *[PALETTE[0]] * (len(heights) - 1)], linewidth=5)
         if truth is not None:
             axes.axvline(truth[i], color=PALETTE[1], linewidth=1.5)
-        axes.set_yticks(heights, [f"{n} rollouts" if n != 1 else "1 rollout" for n in counts])
+        axes.set_yticks(heights, [tables.rollouts(n) for n in after])
         axes.set_ylim(len(heights) - 0.5, -0.5)
         axes.tick_params(labelleft=i % columns == 0)
         axes.locator_params(axis="x", nbins=5)

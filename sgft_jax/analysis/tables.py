@@ -40,6 +40,11 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *rows))
 
 
+def rollouts(n: int) -> str:
+    """So many of them, in words."""
+    return f"{n} rollout{'s' * (n != 1)}"
+
+
 def summary(curves: Sequence[Curve], reference: str | None = None) -> str:
     """A row for each curve of one task, gap and set of priors; the methods' defaults decide the grid of the area.
 
@@ -136,7 +141,7 @@ def middle(curve: Curve, scores: np.ndarray | None) -> str:
 def outcome(curves: Sequence[Curve]) -> str:
     """A row for each curve, a column for each evaluation that any of them has."""
     points = sorted({int(n) for curve in curves for n in curve.x})
-    head = ["method", *(f"{n} rollout{'s' * (n > 1)}" if n else "zero-shot" for n in points)]
+    head = ["method", *(rollouts(n) if n else "zero-shot" for n in points)]
     return markdown(head, [[curve.name, *(middle(curve, at(curve, n)) for n in points)] for curve in curves])
 
 

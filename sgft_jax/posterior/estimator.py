@@ -56,7 +56,8 @@ class Estimator(NamedTuple):
     """What a trained network needs: its params and the statistics of what it reads.
 
     ranks: [MOST, d, intervals] log density of the true numbers' ranks in their histograms, after 1, 2, ... rollouts.
-    usual: [MOST] the `contradiction` that 95 % of the simulator's systems do not exceed. `learning.finish` fits both.
+    usual: [MOST] the `contradiction` of halves that 95 % of the simulator's systems do not exceed. `learning.finish`
+    fits both.
     """
 
     params: PyTree

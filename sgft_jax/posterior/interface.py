@@ -63,15 +63,16 @@ class Inference(NamedTuple):
     that does best there. promised: [2 + n] success there of the prior as it is, behind that, and behind each of n other
     corrections.
 
-    nats: [] by which every other rollout contradicts those between. contradicted: [] bool, whether that is more than in
-    95 % of the simulator's systems; of one rollout never. current: [MOST] bool, the rollouts that count: all, or where
-    the system has changed, the later ones.
+    nats: [] by which every other rollout contradicts those between. usual: [] what 95 % of the simulator's systems do
+    not exceed. contradicted: [] bool, whether these rollouts do, of which one never does. current: [MOST] bool, those
+    that count: all, or where the system has changed, the later ones.
     """
 
     points: Array
     distortion: Distortion
     promised: Array
     nats: Array
+    usual: Array
     contradicted: Array
     current: Array
 
@@ -107,12 +108,13 @@ def infer(
     counts, d = jnp.arange(MOST) < count, len(systems.unknowns)
     key_points, key_choice, key_halves, key_change = jax.random.split(key, 4)
     nats = contradiction(estimator, rollouts, alternating(counts), d, key_halves)
-    contradicted = _too_much(estimator, counts, nats)
+    usual = _usual(estimator, counts)
+    contradicted = (count > 1) & (nats > usual)
     age = (count - 1 - jnp.arange(MOST)) % MOST
     current = jnp.where(contradicted, counts, _current(estimator, rollouts, counts, age, d, key_change))
     points = draw(estimator, rollouts, current, d, key_points, CANDIDATES + JUDGES)
     distortion, promised = choose(env, systems, policy, params, points, key_choice, *others)
-    return Inference(points, distortion, promised, nats, contradicted, current)
+    return Inference(points, distortion, promised, nats, usual, contradicted, current)
 
 
 def _current(estimator: Estimator, rollouts: Rollout, counts: Array, age: Array, d: int, key: Key) -> Array:
@@ -123,14 +125,13 @@ def _current(estimator: Estimator, rollouts: Rollout, counts: Array, age: Array,
     for key_half in jax.random.split(key, _CHANGES):
         late = counts & (age < (counts.sum() + 1) // 2)
         nats = contradiction(estimator, rollouts, (counts & ~late, late), d, key_half)
-        counts = jnp.where(_too_much(estimator, counts, nats), late, counts)
+        counts = jnp.where(nats > _usual(estimator, counts), late, counts)
     return counts
 
 
-def _too_much(estimator: Estimator, counts: Array, nats: Array) -> Array:
-    """[] bool, whether 95 % of the simulator's systems contradict themselves less than that."""
-    n = counts.sum()
-    return (n > 1) & (nats > estimator.usual[jnp.maximum(n, 1) - 1])
+def _usual(estimator: Estimator, counts: Array) -> Array:
+    """[] nats by which 95 % of the simulator's systems contradict themselves at most."""
+    return estimator.usual[jnp.maximum(counts.sum(), 1) - 1]
 
 
 def posterior_interface(env: Env, systems: Candidates, policy: Policy, fitting: Interface) -> Interface:

@@ -92,6 +92,12 @@ def test_an_estimator_says_which_system_it_may_be(usual, tmp_path, monkeypatch, 
         trained is None or "action_rotation" in trained.effects
     )
 
+    # What an earlier diagnosis has left is not beside the numbers of a later one.
+    save_prior(tmp_path / "bare", 0)
+    call("--prior", tmp_path / "bare", "--real", gap, "--rollouts", 1, "--out", tmp_path / "runs", "--json")
+    capsys.readouterr()
+    assert [path.name for path in home.iterdir()] == ["diagnosis.json"]
+
     # From disk nobody knows what is true, and the same rollouts by two policies say as much.
     recorded = record(tmp_path / "robot", success=(1,))
     call("--prior", tmp_path / "prior", "--real", recorded, "--rollouts", 1, "--out", tmp_path / "runs", "--json")
