@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from envs.base import (
     NOTHING,
@@ -150,14 +151,11 @@ def with_system(env: Env, system: tuple[Varying, ...]) -> Env:
     """
     if not system:
         return env
-    place = {name: i for i, name in enumerate(_names(env))}
-    if odd := [v for v in system if (v.name, v.index) not in place]:
-        raise UserError(f"{env.name}: has no parameter or effect {odd[0].name!r} with a number {odd[0].index}")
-    where = np.array([place[v.name, v.index] for v in system])
+    where = places(env, system)
     low, high = (np.array([getattr(v, end) for v in system], np.float32) for end in ("low", "high"))
 
     def tell(world: World, state: EnvState, memory: tuple) -> Array:
-        everything = jnp.concatenate([world.theta.params, *(jnp.ravel(x) for x in state.effects)])
+        everything = ravel_pytree((world.theta.params, state.effects))[0]
         return jnp.clip(2.0 * (everything[where] - low) / (high - low) - 1.0, -1.0, 1.0)
 
     longer = extended(
@@ -222,18 +220,12 @@ def simulator(
     rows = {p.name: row for p, row in zip(env.parameters, ranges, strict=True)}
     for number in system:
         rows.get(number.name, np.zeros(2))[:] = number.low, number.high
-    model_of, key = patches(env, ranges).model, jax.random.key(0)
-    place = {name: i for i, name in enumerate(_names(env))}
-    where = np.array([place[v.name, v.index] for v in system])
+    model_of, key, where = patches(env, ranges).model, jax.random.key(0), places(env, system)
     low, high = (np.array([getattr(v, end) for v in system]) for end in ("low", "high"))
-    ends = make_range(env, {**env.training, "latency_jitter": 0.0})
-    usual = jax.tree.map(lambda low, high: 0.5 * (low + high), ends.low, ends.high)
-    nominal = jnp.concatenate([jnp.array([p.nominal for p in env.parameters]), *(jnp.ravel(x) for x in usual)])
-    sizes = np.cumsum([len(env.parameters), *(x.size for x in usual)])[:-1]
+    nominal, unravel = ravel_pytree(nominal_numbers(env, {"latency_jitter": 0.0}))
 
     def world_of(point: Array) -> World:
-        params, *parts = jnp.split(nominal.at[where].set(low + 0.5 * (1.0 + point) * (high - low)), sizes)
-        drawn = Effects(*(part.reshape(x.shape) for part, x in zip(parts, usual, strict=True)))
+        params, drawn = unravel(nominal.at[where].set(low + 0.5 * (1.0 + point) * (high - low)))
         drawn = drawn._replace(latency_jitter=jnp.zeros(()))
         return World(Theta(params, EffectRange(drawn, drawn)), model_of(params))
 
@@ -251,6 +243,23 @@ def simulator(
         return change(obs, action), 10.0 * (change(obs + step, action) - change(obs - step, action))
 
     return change
+
+
+def nominal_numbers(env: Env, effects: Mapping[str, Value] = NOTHING) -> tuple[Array, Effects]:
+    """Nominal parameters [n_params], and effects in the middle of their ranges in training, or of those named here."""
+    ends = make_range(env, {**env.training, **effects})
+    middle = jax.tree.map(lambda low, high: jnp.float32(0.5 * (low + high)), ends.low, ends.high)
+    return jnp.array([p.nominal for p in env.parameters], jnp.float32), middle
+
+
+def places(env: Env, system: tuple[Varying, ...]) -> np.ndarray:
+    """[k] where the numbers of a system are among all of (parameters, effects), raveled. Raises UserError for others
+    than these have.
+    """
+    place = {name: i for i, name in enumerate(_names(env))}
+    if odd := [v for v in system if (v.name, v.index) not in place]:
+        raise UserError(f"{env.name}: has no parameter or effect {odd[0].name!r} with a number {odd[0].index}")
+    return np.array([place[v.name, v.index] for v in system])
 
 
 def _names(env: Env) -> list[tuple[str, int]]:

@@ -21,6 +21,7 @@ class Pretraining(IntEnum):
     START = 2
     REPORT = 3
     VALUE = 4
+    DOMAIN = 5
 
 
 class Finetuning(IntEnum):

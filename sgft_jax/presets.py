@@ -63,6 +63,9 @@ class PretrainConfig(checks.Checked):
     """Worlds compiled for each seed; every episode takes place in a random one."""
     refresh_every: Annotated[int, checks.least(0), checks.countable] = 0
     """Chunks after which new worlds are drawn and all environments start new episodes; 0 keeps the first worlds."""
+    doraemon: bool = False
+    """Draw worlds from a domain that begins around the nominal system and widens with every new set, as fast as the
+    policy succeeds, see `envs.doraemon`."""
     replay_capacity: checks.Count = 1_000_000
     """Transitions kept; new ones replace the oldest."""
     random_transitions: checks.Count = 500_000
@@ -125,6 +128,8 @@ class PretrainConfig(checks.Checked):
             raise checks.refusal("blind_actor", True, "off where sees-system is off: there is nothing to hide")
         if self.network.blind and not self.blind_actor:
             raise checks.refusal("network.blind", self.network.blind, "0: blind-actor sets it")
+        if self.doraemon and not self.refresh_every:
+            raise checks.refusal("doraemon", True, "off where refresh-every is 0: the domain widens with new worlds")
         for name in ("random_transitions", "replay_capacity"):
             if getattr(self, name) < self.n_envs:
                 wanted = f"at least n-envs = {self.n_envs}, one step of all environments"
@@ -202,6 +207,8 @@ PRESETS: dict[str, PretrainConfig] = {
     # The same, told what differs: for the method `sysid`, which identifies it.
     "informed": replace(_ROBUST, sees_system=True, system_noise=0.1),
     "asymmetric": replace(_ROBUST, sees_system=True, system_noise=0.0, blind_actor=True),
+    # Half the environments, so that 25 sets of worlds fit into the same steps and updates.
+    "doraemon": replace(_ROBUST, doraemon=True, refresh_every=1, n_envs=2048, updates_per_step=24, chunk_steps=50),
     # The paper's numbers (Appendix C): one update of batch 256 per environment step, 2 x 512 units, alpha from 1.
     "paper": PretrainConfig(
         n_envs=64,

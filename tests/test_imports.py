@@ -60,6 +60,7 @@ ORDER = {
             "domains",
             "patches",
             "observations",
+            "doraemon",
             "rewards",
             "gaps",
         ),
@@ -69,7 +70,7 @@ ORDER = {
         *("types", "theory", "keys", "checks", "stacking", "files", "math", "models", "posterior", "data", "planning"),
         *("learners", "policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
         *("datasets", "systems", "train"),
-        *("examination", "methods", "analysis", "api", ""),
+        *("methods", "analysis", "api", ""),
     ),
     "experiments": ("runner", "commands", "studies"),  # `bench` is a part of a command
 }

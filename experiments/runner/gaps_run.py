@@ -138,7 +138,7 @@ def train(
     which = jnp.repeat(jnp.arange(len(reals)), len(seeds))
     reserve(memory(seen, config), copies=len(which))
 
-    def pools(number: int) -> World:
+    def pools(number: int, domains: PyTree) -> World:
         """All seeds of a gap live in the same worlds."""
         worlds = real_worlds(env, reals, jax.random.fold_in(jax.random.key(seeds[0]), number), config.worlds)
         return jax.tree.map(lambda x: x[which], worlds)

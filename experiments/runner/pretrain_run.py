@@ -19,7 +19,8 @@ import numpy as np
 import envs
 from envs import gaps, mesh
 from envs.base import Env, World
-from envs.domains import with_actuators
+from envs.domains import uniform, with_actuators
+from envs.doraemon import entropy
 from envs.gaps import SIM, Gap
 from envs.observations import all_varying, blurred, varying, with_system
 from envs.rollout import Episode, heldout_worlds, load_gap, pool_size, real_env, training_worlds
@@ -141,7 +142,9 @@ class _Run(Training):
         self.fits = recipe_of(env, self.config).valued
         self.card = pretraining.prior_card(env, self.config) | (pretraining.system_card(system) if self.fits else {})
         self.policy = make_policy(self.card, env)
-        self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
+        self.domain, self.make = pretraining.domain_of(env, self.config), pretraining.maker(env, self.config)
+        self.widening = pretraining.training_pools(self.config, self.seeds, self.domain, self.make)
+        self.whole = functools.lru_cache(maxsize=1)(self._whole)  # worlds take long to compile
         self.shapes = functools.cache(self._shapes)
         self.programs = pretraining.make_programs(env, self.config, len(self.seeds))
         measure = functools.partial(make_report, env, self.policy, gamma=self.config.gamma)
@@ -166,10 +169,11 @@ class _Run(Training):
             if alone:
                 with self.announced(None):
                     self._compile_evaluations(ahead)
-            data = {"pools": self.pools, "random": self._random(ahead), "programs": self.programs}
+            data = {"pools": self.pools, "domain": self.domain, "random": self._random(ahead)}
             with self.announced(None):
                 ahead.wait(self.programs.train.init, self.programs.train.chunk, self.heldout.program(self.policy))
-                steps = pretraining.pretrain(self.env, self.config, self.seeds, state=state, **data)
+                begun = {"state": state, "programs": self.programs}
+                steps = pretraining.pretrain(self.env, self.config, self.seeds, **begun, **data)
             self.follow(steps, done)
             assert self.best is not None  # evaluated before the first chunk
             ahead.wait(self.fit, self.measure, self.judges.hold)
@@ -181,7 +185,7 @@ class _Run(Training):
         """The worlds."""
         n, count = self.config.eval_episodes, self.count * self.config.worlds
         with self.clock("worlds"), doing(f"building {count:,} worlds", 3 + 0.01 * count):
-            self.pools(0)
+            self._first()
             heldout, self.final = (
                 _stacked([heldout_worlds(self.env, self.gap, jax.random.key(seed), n)])
                 for seed in (_HELDOUT_SEED, _FINAL_SEED)
@@ -190,7 +194,7 @@ class _Run(Training):
 
     def _compile(self, ahead: Ahead, *, begins: bool) -> None:
         """Begins to compile what trains, first what takes longest, while the worlds are still being built."""
-        collect, (init, chunk, _) = self.programs
+        collect, (init, chunk, _), _ = self.programs
         random, start = (seed_keys(self.seeds, purpose) for purpose in (Pretraining.RANDOM, Pretraining.START))
         ahead.promise(chunk, self.shapes)
         if begins:
@@ -229,27 +233,43 @@ class _Run(Training):
     def _shapes(self) -> Shapes:
         """What programs are compiled for and checkpoints are read into."""
         random, start = (seed_keys(self.seeds, purpose) for purpose in (Pretraining.RANDOM, Pretraining.START))
-        few = training_worlds(self.env, self.gap, jax.random.key(0), 2)
+        few = self._drawn(jax.random.key(0), 2)
         n = self.config.worlds if pool_size(few) == 2 else 1  # one, where nothing varies
         worlds = jax.tree.map(lambda x: jax.ShapeDtypeStruct((self.count, n, *x.shape[1:]), x.dtype), few)
         experience = self.programs.collect.eval_shape(worlds, random)
-        return Shapes(worlds, experience, self.programs.train.init.eval_shape(worlds, experience, start))
+        state = self.programs.train.init.eval_shape(worlds, experience, start)
+        domain = jax.eval_shape(functools.partial(pretraining.domains, self.domain, self.count))
+        return Shapes(worlds, experience, state._replace(domain=domain))
 
-    def _pools(self, number: int) -> World:
-        """The worlds [seeds, W] of a set."""
+    def _drawn(self, key: Key, n: int) -> World:
+        """Worlds [n] of the whole domain."""
+        if self.config.doraemon:
+            return self.make(uniform(self.env).sample((), key, n))
+        return training_worlds(self.env, self.gap, key, n)
+
+    def _whole(self, number: int) -> World:
+        """A set of worlds [seeds, W] of the whole domain."""
         keys = pretraining.world_keys(self.seeds, number)
-        return _stacked([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
+        return _stacked([self._drawn(key, self.config.worlds) for key in keys])
+
+    def pools(self, number: int, domains: PyTree) -> World:
+        """The worlds [seeds, W] of a set, to train in."""
+        return self.widening(number, domains) if self.config.doraemon else self.whole(number)
+
+    def _first(self) -> World:
+        """Those with which training begins."""
+        return self.pools(0, pretraining.domains(self.domain, self.count))
 
     def _value_pools(self) -> World:
         """The worlds [seeds, W] that V_sim is fitted in: those of training, or more where these are few."""
-        if self.config.worlds >= value_fit.WORLDS or pool_size(self.pools(0)) == 1:
-            return self.pools(0)
+        if self.config.worlds >= value_fit.WORLDS or pool_size(self.whole(0)) == 1:
+            return self.whole(0)
         keys = seed_keys(self.seeds, Pretraining.VALUE)
-        return _stacked([training_worlds(self.env, self.gap, key, value_fit.WORLDS) for key in keys])
+        return _stacked([self._drawn(key, value_fit.WORLDS) for key in keys])
 
     def _heldout_pools(self) -> World:
         """As many that nobody has seen, with sensors as in training, the same for all seeds."""
-        pool = training_worlds(self.env, self.gap, jax.random.key(_VALUE_SEED), value_fit.WORLDS)
+        pool = self._drawn(jax.random.key(_VALUE_SEED), value_fit.WORLDS)
         return jax.tree.map(lambda x: jnp.broadcast_to(x, (self.count, *x.shape)), pool)
 
     def _saved(self, state: FleetState) -> Saved:
@@ -265,7 +285,7 @@ class _Run(Training):
         count = self.count * self.config.random_transitions
         with self.clock("random"), doing(f"collecting {count:,} random transitions", 15 + count / 200_000, once=True):
             ahead.wait(self.env.prepare, self.programs.collect)
-            rows = self.programs.collect(self.pools(0), seed_keys(self.seeds, Pretraining.RANDOM))
+            rows = self.programs.collect(self._first(), seed_keys(self.seeds, Pretraining.RANDOM))
             random = jax.block_until_ready(rows)
         self.writer.write(random, functools.partial(checkpoint.save, folder, 0, meta=expect))
         return random
@@ -276,6 +296,8 @@ class _Run(Training):
         return int(jax.device_get(state.rounds)[0]) * self.config.n_envs
 
     def log(self, state: FleetState, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
+        if self.config.doraemon:
+            values["domain/entropy"] = np.array([entropy(stacking.member(state.domain, i)) for i in range(self.count)])
         super().log(state, values, seconds)
         ended = values["train/episodes"].all()  # episodes begin together, so in some chunks none ends
         name = "success" if self.env.score == "success" else "reward"
@@ -373,7 +395,7 @@ class _Run(Training):
         """[seeds] measurements, as NumPy arrays, and what they say of V_sim."""
         keys = seed_keys(self.seeds, Pretraining.REPORT)
         pools = self._heldout_pools()
-        measured = self.measure(self.pools(0), params, keys), self.judges.hold(pools, params, keys)
+        measured = self.measure(self.whole(0), params, keys), self.judges.hold(pools, params, keys)
         report, held = jax.tree.map(np.asarray, mesh.local(measured))
         again = self.fits and self.gap is None and self.env.restore is not None
         states = min(_STATES, self.config.eval_episodes // 2) if again else 0

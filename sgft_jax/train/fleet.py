@@ -26,6 +26,8 @@ __all__ = ["FleetState"]
 
 # explore(fleet, key) -> (actions [n, act_dim], carries [n] of the policy)
 Explore = Callable[[Fleet, Key], tuple[Array, PyTree]]
+# pools(number of a set of worlds, domains [M]) -> its worlds [M, W], a pool for each member
+Pools = Callable[[int, PyTree], World]
 # note(learner's state, before, action, after) -> what is kept of one simulated step beside its row
 Note = Callable[[PyTree, EnvState, Array, EnvState], PyTree]
 
@@ -35,7 +37,7 @@ class FleetState(NamedTuple):
 
     learner: the agent. replay: experience of its simulators. fleet: these in flight. The last two are None for an agent
     that does not act in a simulator. key: decides what comes. rounds: [M] int32, rounds done. notes: `ReplayState` of
-    what a `Note` says of the rows, None without one.
+    what a `Note` says of the rows, None without one. domain: state of the `Domain` that worlds are drawn from.
     """
 
     learner: Any
@@ -44,6 +46,7 @@ class FleetState(NamedTuple):
     key: Key
     rounds: Array
     notes: Any = None
+    domain: Any = ()
 
 
 class StartKeys(NamedTuple):
@@ -230,7 +233,8 @@ def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None
 def spread(state: FleetState) -> FleetState:
     """Environments and experience in pieces on the devices of a mesh, the agent whole on each of them."""
     pieces = state._replace(replay=spread_replay(state.replay), fleet=split(state.fleet))
-    return pieces._replace(learner=whole(state.learner), key=whole(state.key), rounds=whole(state.rounds))
+    alone = (whole(x) for x in (state.learner, state.key, state.rounds, state.domain))
+    return pieces._replace(**dict(zip(("learner", "key", "rounds", "domain"), alone, strict=True)))
 
 
 def spread_replay(experience: PyTree) -> PyTree:
@@ -276,29 +280,31 @@ def make_programs(trainer: Trainer, members: int, *, shared: bool) -> Trainer:
 def train(
     plan: Plan,
     programs: Trainer,
-    pools: Callable[[int], World],
+    pools: Pools,
     data: PyTree,
     state: FleetState,
     *,
     refresh_every: int = 0,
+    adapt: Callable[[World, FleetState], PyTree] = lambda worlds, state: state.domain,
 ) -> Iterator[tuple[FleetState, Metrics]]:
     """Trains from a state until all chunks are done; the state is consumed.
 
-    pools: number of a set of worlds -> its worlds [M, W]. refresh_every: chunks after which the next set is asked for,
-    0 = never.
+    pools: see `Pools`. refresh_every: chunks after which the next set is asked for, 0 = never. adapt(worlds, state) ->
+    the domains [M] that it is drawn from.
 
     Yields the state that it starts from with no metrics, once everything is compiled, then once per chunk. Metrics are
     arrays [M]. A yielded state is valid until the next step, which donates its arrays: copy it to keep it longer.
     """
     begun, refresh_every = plan.chunks_done(state), refresh_every or plan.chunks
     number = max(begun - 1, 0) // refresh_every
-    worlds = pools(number)
+    worlds = pools(number, state.domain)
     chunk = programs.chunk.lower(worlds, data, state).compile() if begun < plan.chunks else programs.chunk
     yield state, {}
     for done in range(begun, plan.chunks):
         if done // refresh_every != number:
             number = done // refresh_every
-            worlds = pools(number)
+            state = state._replace(domain=adapt(worlds, state))
+            worlds = pools(number, state.domain)
             state = programs.renew(worlds, state)
         state, metrics = chunk(worlds, data, state)
         yield state, metrics

@@ -44,7 +44,7 @@ def train(
     programs = fleet.make_programs(fleet.make_trainer(env, plan, gamma=gamma, note=note), keys.shape[0], shared=True)
     real = jax.tree.map(jnp.asarray, real)
     begun = programs.init(pools, real, keys) if state is None else state
-    return fleet.train(plan, programs, lambda number: pools, agent.keep(real), begun)
+    return fleet.train(plan, programs, lambda number, domains: pools, agent.keep(real), begun)
 
 
 def shape_of(env: Env, agent: HybridAgent, schedule: Schedule, pools: World, real: RealData, keys: Key) -> FleetState:

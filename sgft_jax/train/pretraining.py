@@ -6,12 +6,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from envs.base import Domain, Env, EnvState, Varying, World
+from envs.base import Domain, Env, EnvState, Theta, Varying, World
 from envs.domains import sample_worlds, uniform
+from envs.doraemon import doraemon
 from envs.mesh import split, whole
 from envs.observations import all_varying
-from envs.rollout import Fleet, launch
+from envs.patches import patches
+from envs.rollout import Fleet, launch, play_episode, pool_size
 from envs.types import Array, Key, PyTree, Transition
 from sgft_jax.algorithms import make_policy, recipe_of
 from sgft_jax.files.disk import jsonable
@@ -20,30 +23,32 @@ from sgft_jax.models import normalizer
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.stacking import member, stack
 from sgft_jax.train import fleet, value_fit
-from sgft_jax.train.fleet import Collected, FleetState, Plan, RoundKeys, StartKeys, Trainer, over_members
+from sgft_jax.train.fleet import Collected, FleetState, Plan, Pools, RoundKeys, StartKeys, Trainer, over_members
 from sgft_jax.types import Batch, Metrics, Prior
 
 __all__ = ["pretrain", "priors_of"]
 
 _RANDOM_STEPS = 3_125  # of a simulator under random actions, at most
 
-Pools = Callable[[int], World]  # number of a set of worlds -> its worlds [M, W], a pool for each member
-
 
 class Programs(NamedTuple):
     """What pretraining compiles, of M members.
 
     collect(worlds [M, W], keys [M]) -> experience [M, ...] under random actions. train: see `fleet.make_programs`.
+    succeed(worlds [M, W], learners [M], keys [M]) -> [M, W] success of an exploring episode in each.
     """
 
     collect: Any
     train: Trainer
+    succeed: Any
 
 
 def make_programs(env: Env, config: PretrainConfig, members: int) -> Programs:
     """Jitted: they compile when they are first called, or before, by `lower(...).compile()`."""
     collect = over_members(functools.partial(random_experience, env, config), members)
-    return Programs(jax.jit(collect), fleet.make_programs(make_trainer(env, config), members, shared=False))
+    succeed = over_members(functools.partial(success_in, env, config), members)
+    train = fleet.make_programs(make_trainer(env, config), members, shared=False)
+    return Programs(jax.jit(collect), train, jax.jit(succeed))
 
 
 # --- the iterator -----------------------------------------------------------------------------------------------------
@@ -54,6 +59,7 @@ def pretrain(
     config: PretrainConfig,
     seeds: Sequence[int] | Array,
     *,
+    domain: Domain | None = None,
     pools: Pools | None = None,
     random: PyTree = None,
     state: FleetState | None = None,
@@ -61,37 +67,75 @@ def pretrain(
 ) -> Iterator[tuple[FleetState, Metrics]]:
     """Trains M members, one for each seed, for `config.env_steps` environment steps each, see `fleet.train`.
 
-    pools: where they live; default the training domain of `env`. `config.refresh_every` decides when the next set is
-    asked for. random: experience under random actions, see `Programs`; collected here if None. state: where an
-    earlier run stopped, or None. Both are consumed. Every random draw follows from the seeds, so a resumed run ends
-    like an uninterrupted one. A round of the state is one step of all environments. programs: see `make_programs`.
+    domain: what worlds are drawn from; default that of training. pools: where members live; default worlds of that
+    domain. `config.refresh_every` decides when the next set is asked for. random: experience under random actions, see
+    `Programs`; collected here if None. state: where an earlier run stopped, or None. Both are consumed. Every random
+    draw follows from the seeds, so a resumed run ends like an uninterrupted one. A round of the state is one step of
+    all environments. programs: see `make_programs`.
     """
     seeds = jnp.asarray(seeds, jnp.uint32)
-    plan, members, pools = make_plan(env, config), len(seeds), pools or training_pools(env, config, seeds)
-    programs = programs or make_programs(env, config, members)
+    plan, members, domain = make_plan(env, config), len(seeds), domain or domain_of(env, config)
+    pools = pools or training_pools(config, seeds, domain, maker(env, config))
+    programs, first = programs or make_programs(env, config, members), domains(domain, members)
     if random is None:
-        random = programs.collect(pools(0), seed_keys(seeds, Pretraining.RANDOM))
+        random = programs.collect(pools(0, first), seed_keys(seeds, Pretraining.RANDOM))
     else:
         random = jax.jit(over_members(fleet.spread_replay, members), donate_argnums=0)(random)
     if state is None:
-        begun = programs.train.init(pools(0), random, seed_keys(seeds, Pretraining.START))
+        begun = programs.train.init(pools(0, first), random, seed_keys(seeds, Pretraining.START))._replace(domain=first)
     else:
         begun = jax.jit(over_members(fleet.spread, members), donate_argnums=0)(state)
-    return fleet.train(plan, programs.train, pools, random, begun, refresh_every=config.refresh_every)
+
+    def adapt(worlds: World, state: FleetState) -> PyTree:
+        keys = jax.vmap(jax.random.fold_in)(seed_keys(seeds, Pretraining.DOMAIN), state.rounds)
+        success = programs.succeed(worlds, state.learner, keys)
+        rows = (member((state.domain, worlds.theta, success), i) for i in range(members))
+        return stack([domain.update(*row) for row in rows])
+
+    adapts = {"adapt": adapt} if config.doraemon else {}
+    return fleet.train(plan, programs.train, pools, random, begun, refresh_every=config.refresh_every, **adapts)
+
+
+def domain_of(env: Env, config: PretrainConfig) -> Domain:
+    """What worlds are drawn from."""
+    return doraemon(env) if config.doraemon else uniform(env)
+
+
+def domains(domain: Domain, members: int) -> PyTree:
+    """[M] the states with which a domain begins."""
+    return stack([domain.init()] * members)
 
 
 def training_pools(
-    env: Env, config: PretrainConfig, seeds: Sequence[int] | Array, domain: Domain | None = None
+    config: PretrainConfig, seeds: Sequence[int] | Array, domain: Domain, make: Callable[[Theta], World]
 ) -> Pools:
-    """Pools of `config.worlds` worlds each, drawn from a domain (default: the task's training domain) by each seed."""
-    domain = domain or uniform(env)
+    """Pools of `config.worlds` worlds each, drawn from a domain by each seed. make: see `maker`."""
+    last: dict[int, World] = {}  # worlds take long to compile
 
-    @functools.lru_cache(maxsize=1)  # worlds take long to compile
-    def pools(number: int) -> World:
-        keys = world_keys(seeds, number)
-        return stack([env.make_worlds(domain.sample(domain.init(), key, config.worlds)) for key in keys])
+    def pools(number: int, domains: PyTree) -> World:
+        if number not in last:
+            last.clear()
+            rows = enumerate(world_keys(seeds, number))
+            last[number] = stack([make(domain.sample(member(domains, i), key, config.worlds)) for i, key in rows])
+        return last[number]
 
     return pools
+
+
+def maker(env: Env, config: PretrainConfig) -> Callable[[Theta], World]:
+    """What makes worlds [n] of thetas [n]: MuJoCo's compiler, or patches for a domain that adapts, which needs others
+    every few seconds.
+    """
+    if not config.doraemon:
+        return env.make_worlds
+    ranges = np.array([(p.low, p.high) for p in env.parameters]).reshape(-1, 2)
+
+    @functools.cache
+    def program() -> Callable[[Theta], World]:
+        model = patches(env, ranges).model
+        return jax.jit(lambda theta: World(theta, jax.vmap(model)(theta.params)))
+
+    return lambda theta: program()(theta)
 
 
 def world_keys(seeds: Sequence[int] | Array, number: int = 0) -> Key:
@@ -220,6 +264,18 @@ def random_experience(env: Env, config: PretrainConfig, pool: World, key: Key) -
         return _uniform_actions(env, n, key), ()
 
     return fleet.collect(env, kept, explore, pool, start, keys, initial_carry=(), gamma=config.gamma)[0].replay
+
+
+def success_in(env: Env, config: PretrainConfig, pool: World, learner: PyTree, key: Key) -> Array:
+    """[W] success of one member that explores, in an episode in each world of its pool [W]."""
+    recipe, n = recipe_of(env, config).learner, pool_size(pool)
+    act = functools.partial(recipe.act, learner, explore=True)
+
+    def success(world: World, key: Key) -> Array:
+        alone = jax.tree.map(lambda x: x[None], world)
+        return play_episode(env, alone, act, recipe.init_carry(), key, gamma=config.gamma).success
+
+    return jax.vmap(success)(pool, jax.random.split(key, n))
 
 
 def make_trainer(env: Env, config: PretrainConfig) -> Trainer:

@@ -274,7 +274,10 @@ def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
             ["--task", "toi"],
             "task: there is no 'toi', did you mean 'toy'? Choose from: cheetah-run, cheetah-run-du, halfcheetah,",
         ),
-        (["--preset", "fats"], "--preset: there is no 'fats', did you mean 'fast'? Choose from: asymmetric, cpu, fast"),
+        (
+            ["--preset", "fats"],
+            "--preset: there is no 'fats', did you mean 'fast'? Choose from: asymmetric, cpu, doraemon",
+        ),
         (["--config.gama", "0.9"], "did you mean --config.gamma?"),
         (["--task", "toy", "--seeds", "0"], "--seeds is 0: must be at least 1"),
         (["--task", "toy", "--real", "mild"], "toy has no gap 'mild'"),

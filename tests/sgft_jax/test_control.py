@@ -44,8 +44,7 @@ PRETRAIN = PretrainConfig(**LOOP, **LEARNING, **NETWORKS, alpha=0.1)
 @pytest.fixture(scope="module")
 def prior():
     """SAC's, after 14 chunks of 64 environments."""
-    pools = pretraining.training_pools(ENV, PRETRAIN, [0])
-    *_, (state, _) = pretraining.pretrain(ENV, PRETRAIN, [0], pools=pools)
+    *_, (state, _) = pretraining.pretrain(ENV, PRETRAIN, [0])
     return pretraining.priors_of(ENV, PRETRAIN, state)[0]
 
 

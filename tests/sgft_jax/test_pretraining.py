@@ -4,6 +4,7 @@ import functools
 from dataclasses import replace
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import keys
@@ -78,7 +79,7 @@ def counted(*risks, refresh_every=0, resumed=None):
     """
     env, config = toy_terminating.make(), replace(CONFIG, refresh_every=refresh_every)
 
-    def pools(number):
+    def pools(number, domains):
         pool = envs.sample_worlds(env, jax.random.key(number), 4, params={"risk": risks[number]})
         return jax.tree.map(lambda x: x[None], pool)
 
@@ -248,7 +249,7 @@ def test_random_actions_grow_along_the_fleet(key, monkeypatch):
 
 def shapes_of_random(env, config):
     """Of what one member collects under random actions."""
-    worlds = pretraining.training_pools(env, replace(config, worlds=1), [0])(0)
+    worlds = jax.tree.map(lambda x: x[None], envs.sample_worlds(env, jax.random.key(0), 1))
     return pretraining.make_programs(env, config, 1).collect.eval_shape(worlds, jax.random.split(jax.random.key(0), 1))
 
 
@@ -334,3 +335,24 @@ def test_keys_depend_on_seed_and_purpose_alone():
     keys = jax.random.key_data(seed_keys([0, 1, 2], 5))
     np.testing.assert_array_equal(keys[1:], jax.random.key_data(seed_keys([1, 2], 5)))
     assert len(np.unique(np.concatenate([keys, jax.random.key_data(seed_keys([0, 1, 2], 6))]), axis=0)) == 6
+
+
+@pytest.mark.heavy
+def test_a_domain_widens_with_every_set_of_worlds_and_a_resumed_run_ends_alike(monkeypatch):
+    monkeypatch.setattr(pretraining, "success_in", lambda env, config, pool, *rest: pool.theta.params[:, 0] < 2.0)
+    config = replace(CONFIG, doraemon=True, refresh_every=1, env_steps=3 * N * STEPS, n_envs=N, worlds=64)
+    env, seeds = toy.make(), [3, 4]
+
+    def states(state=None):
+        return [jax.tree.map(jnp.copy, reached) for reached, _ in pretrain(env, config, seeds, state=state)]
+
+    straight = states()
+    widths = [np.asarray(reached.domain.a) for reached in straight]
+    assert (widths[0] == widths[1]).all(), "the first set is that of the beginning"
+    assert (widths[2] < widths[1]).all() and (widths[3] < widths[2]).all(), "of every seed, every number"
+    chex.assert_trees_all_equal(states(jax.tree.map(jnp.copy, straight[2]))[-1].domain, straight[-1].domain)
+
+
+def test_a_domain_that_widens_needs_new_worlds():
+    with pytest.raises(UserError, match="off where refresh-every is 0"):
+        replace(CONFIG, doraemon=True)

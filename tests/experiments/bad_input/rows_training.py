@@ -3,7 +3,7 @@
 ROWS = [
     (
         "pretrain --preset fsat",
-        "--preset: there is no 'fsat', did you mean 'fast'? Choose from: asymmetric, cpu, fast,",
+        "--preset: there is no 'fsat', did you mean 'fast'? Choose from: asymmetric, cpu, doraemon,",
     ),
     ("pretrain --seed -1", "--seed is -1: seeds go from 0 to 2147483647"),
     ("pretrain --seed 99999999999999999999", "--seed is 99999999999999999999: seeds go from 0 to 2147483647"),
