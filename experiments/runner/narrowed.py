@@ -17,6 +17,7 @@ from envs.rollout import real_env
 from envs.types import Array, Key, UserError
 from sgft_jax.analysis import tables
 from sgft_jax.diagnosis import Rollouts
+from sgft_jax.posterior import candidates
 from sgft_jax.posterior.candidates import Unknown, unknowns_of, values
 from sgft_jax.posterior.estimator import MOST, Estimator, Rollout, blank, draw, rollout_of
 from sgft_jax.stacking import member
@@ -57,9 +58,9 @@ def posterior(env: Env, estimator: Estimator, rollouts: Rollout, after: Sequence
     """[n, draws, d] points that the first of rollouts [MOST] allow, `after` so many [n]; before any, those of the prior
     over unknowns.
     """
-    d = len(unknowns_of(env))
-    before = jax.random.uniform(key, (_DRAWS, d))
-    return np.stack([_drawn(estimator, rollouts, jnp.int32(n), key, d) if n else before for n in after])
+    unknowns = unknowns_of(env)
+    before = candidates.draw(unknowns, candidates.nominal_of(env), key, _DRAWS)
+    return np.stack([_drawn(estimator, rollouts, jnp.int32(n), key, len(unknowns)) if n else before for n in after])
 
 
 @functools.partial(jax.jit, static_argnames="d")

@@ -1,6 +1,6 @@
 """What is not known of a real system, and the simulated systems that may be it. Pure, but for `candidates`.
 
-A candidate is a point [d] of the unit cube, over which the prior is uniform: one number for each unknown.
+A candidate is a point [d] of the unit cube: one number for each unknown.
 """
 
 import math
@@ -19,6 +19,8 @@ from envs.types import Array, Key
 _SCALE, _BIAS, _TURN = (0.35, 1.7), (-0.6, 0.6), (-1.0, 1.0)  # of commands; of their range [-1, 1]; rad
 _LATENCY = 0.6  # control periods at most
 _ERRORS = 2.5  # a constant error is at most so many of an entry's `error`
+_KINDS = {"action_scale": 1, "action_bias": 1, "action_rotation": 1, "latency": 2, "obs_bias": 3}  # 0: parameters
+_ANYWHERE = 0.5  # share of systems where a kind of errors is of any size
 _NOISIEST = 2.0  # times training's noise of sensors
 _WIDE = 3.0  # from low to high: from here on a number's logarithm is uniform
 
@@ -43,27 +45,57 @@ class Unknown(NamedTuple):
 class Candidates(NamedTuple):
     """Simulated systems of a task, at points [d] of the unit cube.
 
-    world(point [d], place [k]) -> World. place: [k] domain parameters that every episode draws anew, within low, high
-    [k], training's ranges.
+    nominal: [d] the point at which nothing differs. world(point [d], place [k]) -> World. place: [k] domain parameters
+    of a real system, within real [k, 2], or drawn anew for every episode, within training [k, 2].
     """
 
     unknowns: tuple[Unknown, ...]
+    nominal: Array
     world: Callable[[Array, Array], World]
-    low: Array
-    high: Array
+    training: Array
+    real: Array
 
     def draw(self, key: Key, n: int) -> Array:
         """[n, d] points from the prior."""
-        return jax.random.uniform(key, (n, len(self.unknowns)))
+        return draw(self.unknowns, self.nominal, key, n)
 
-    def episode(self, point: Array, key: Key) -> World:
-        """Where a simulated episode of a candidate takes place. Its sensors are up to twice as noisy as training's."""
+    def place(self, key: Key) -> Array:
+        """[k] a place of a real system that stays where it is."""
+        return jax.random.uniform(key, len(self.real), minval=self.real[:, 0], maxval=self.real[:, 1])
+
+    def episode(self, point: Array, key: Key, place: Array | None = None) -> World:
+        """Where a simulated episode of a candidate takes place: [k], drawn anew if None. Its sensors are up to twice as
+        noisy as training's.
+        """
         key_place, key_noise = jax.random.split(key)
-        share = jax.random.uniform(key_place, self.low.shape)
-        world = self.world(point, self.low + (self.high - self.low) * share)
+        low, high = self.training.T
+        drawn = jax.random.uniform(key_place, low.shape, minval=low, maxval=high)
+        world = self.world(point, drawn if place is None else place)
         effects = world.theta.effects.low
         noise = jax.random.uniform(key_noise, maxval=_NOISIEST) * effects.obs_noise
         return world._replace(theta=world.theta._replace(effects=exactly(effects._replace(obs_noise=noise))))
+
+
+def draw(unknowns: tuple[Unknown, ...], nominal: Array, key: Key, n: int) -> Array:
+    """[n, d] points from the prior over systems.
+
+    Parameters are anywhere in their ranges. Errors of commands, latency and errors of sensors are each anywhere in half
+    of the systems; in the others they are at most so far from nominal [d] as a share says that is drawn, too, for most
+    robots do not err in every way at once.
+    """
+    kinds = np.array([_KINDS.get(u.name, 0) for u in unknowns])
+    key_point, key_anywhere, key_share = jax.random.split(key, 3)
+    size = (n, 1 + max(_KINDS.values()))
+    anywhere = jax.random.bernoulli(key_anywhere, _ANYWHERE, size).at[:, 0].set(True)
+    shares = jnp.where(anywhere, 1.0, jax.random.uniform(key_share, size))[:, kinds]
+    return nominal + shares * (jax.random.uniform(key_point, (n, len(unknowns))) - nominal)
+
+
+def nominal_of(env: Env) -> Array:
+    """[d] the point at which nothing differs from the nominal system."""
+    numbers = {p.name: p.nominal for p in env.parameters} | {"action_scale": 1.0}
+    unknowns = unknowns_of(env)
+    return point_of(unknowns, jnp.array([numbers.get(u.name, 0.0) for u in unknowns]))
 
 
 def values(unknowns: tuple[Unknown, ...], point: Array) -> Array:
@@ -119,12 +151,12 @@ def candidates(env: Env) -> Candidates:
     model = patches(env, ranges).model
     unknowns, names = unknowns_of(env), [p.name for p in env.parameters]
     nothing = make_range(env, {"obs_noise_prob": 1.0, "obs_noise": _noise(env)}).low
-    nominal = jnp.array([p.nominal for p in env.parameters])
+    defaults = jnp.array([p.nominal for p in env.parameters])
     where = np.array([i for i, p in enumerate(env.parameters) if p.place], int)
-    training = np.array([(p.low, p.high) for p in env.parameters]).reshape(-1, 2)
+    training = np.array([(p.low, p.high) for p in env.parameters]).reshape(-1, 2)[where]
 
     def world(point: Array, place: Array) -> World:
-        params, effects = nominal.at[where].set(place), nothing._asdict()
+        params, effects = defaults.at[where].set(place), nothing._asdict()
         for unknown, value in zip(unknowns, values(unknowns, point), strict=True):
             if unknown.name in Effects._fields:
                 old = effects[unknown.name]
@@ -133,7 +165,8 @@ def candidates(env: Env) -> Candidates:
                 params = params.at[names.index(unknown.name)].set(value)
         return World(Theta(params, exactly(Effects(**effects))), model(params))
 
-    return Candidates(unknowns, world, *(jnp.asarray(end, jnp.float32) for end in training[where].T))
+    places = (jnp.asarray(box, jnp.float32) for box in (training, ranges[where]))
+    return Candidates(unknowns, nominal_of(env), world, *places)
 
 
 def exactly(effects: Effects) -> EffectRange:

@@ -1,5 +1,6 @@
 """How the estimator learns: from rollouts of simulated systems that are known. Pure."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -29,9 +30,10 @@ from sgft_jax.posterior.estimator import (
 TOGETHER = (1, 2, 4, MOST)  # how many an update reads; each number in its turn
 _BATCH = 1024  # rollouts of an update
 _RATE, _WARMUP, _GRADIENT = 5e-4, 500, 1.0  # Adam's, the updates until it is reached, and the largest norm
-_PLAIN, _NEAR = 0.5, 0.35  # shares of rollouts without a correction, and with one that is nearly right
+_NEAR = 0.7  # share of corrections that are nearly right
 _NEARLY, _WRONG = 0.12, 0.5  # std of what corrections miss, in units of the cube
-_EXPLORES = 0.5  # share of rollouts that explore, as training rollouts do
+_STAYS = 0.5  # share of systems where things stay in one place, which may be any of a real system
+_EXPLORES = 0.5  # share of systems where rollouts explore, and of these rollouts
 
 _USUAL = 0.95  # share of systems whose rollouts contradict each other less than that
 _EVEN = 10.0  # imagined true numbers in each interval
@@ -61,23 +63,38 @@ class Learning(NamedTuple):
 def simulate(env: Env, systems: Candidates, policy: Policy, params: PyTree, key: Key, n: int) -> Lessons:
     """Rollouts in n systems of the prior, by the policy behind corrections as they may be deployed: none, one that is
     nearly right, or one that is wrong.
+
+    Rollouts of a system are as much alike as those of a robot are: its share without a correction is anything from
+    none to all, and so is how much of what corrections miss is the same in all. Else ten rollouts of one policy would
+    tell the estimator more than there is to know. In half of the systems things stay where no training has them, or
+    their places would pass for errors of sensors.
     """
     key_points, key_play = jax.random.split(key)
     points = systems.draw(key_points, n)
 
     def record(point: Array, key: Key) -> Rollout:
-        key_kind, key_miss, key_explore, key_world, key_episode = jax.random.split(key, 5)
-        kind = jax.random.uniform(key_kind)
-        std = jnp.where(kind < _PLAIN + _NEAR, _NEARLY, _WRONG)
-        near = jnp.clip(point + std * jax.random.normal(key_miss, point.shape), 0.0, 1.0)
-        plain, undo = none(env.act_dim, env.measured_dim), correction(env, systems.unknowns, near)
-        deployed = params._replace(distortion=jax.tree.map(lambda a, b: jnp.where(kind < _PLAIN, a, b), plain, undo))
-        explore = jax.random.bernoulli(key_explore, _EXPLORES)
-        episode = play(env, policy, deployed, systems.episode(point, key_world), key_episode, explore=explore)
-        return rollout_of(env, episode.transitions, episode.valid, episode.success)
+        key_plain, key_alike, key_miss, key_explores, key_stays, key_place, *keys = jax.random.split(key, 6 + MOST)
+        plain, alike = jax.random.uniform(key_plain), jax.random.uniform(key_alike)
+        explores = _EXPLORES * jax.random.bernoulli(key_explores, _EXPLORES)
+        lasting = jnp.sqrt(alike) * jax.random.normal(key_miss, point.shape)
+        stays, place = jax.random.bernoulli(key_stays, _STAYS), systems.place(key_place)
 
-    keys = jax.random.split(key_play, (n, MOST))
-    return Lessons(points, jax.vmap(jax.vmap(record, (None, 0)))(points, keys))
+        def rollout(key: Key) -> Rollout:
+            key_kind, key_near, key_miss, key_explore, key_world, key_episode = jax.random.split(key, 6)
+            miss = lasting + jnp.sqrt(1.0 - alike) * jax.random.normal(key_miss, point.shape)
+            std = jnp.where(jax.random.bernoulli(key_near, _NEAR), _NEARLY, _WRONG)
+            undo = correction(env, systems.unknowns, jnp.clip(point + std * miss, 0.0, 1.0))
+            nothing, is_plain = none(env.act_dim, env.measured_dim), jax.random.bernoulli(key_kind, plain)
+            deployed = params._replace(distortion=jax.tree.map(functools.partial(jnp.where, is_plain), nothing, undo))
+            explore = jax.random.bernoulli(key_explore, explores)
+            anywhere, there = systems.episode(point, key_world), systems.episode(point, key_world, place)
+            world = jax.tree.map(functools.partial(jnp.where, stays), there, anywhere)
+            episode = play(env, policy, deployed, world, key_episode, explore=explore)
+            return rollout_of(env, episode.transitions, episode.valid, episode.success)
+
+        return jax.vmap(rollout)(jnp.stack(keys))
+
+    return Lessons(points, jax.vmap(record)(points, jax.random.split(key_play, n)))
 
 
 def begin(key: Key, lessons: Lessons) -> Learning:
