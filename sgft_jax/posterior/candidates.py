@@ -61,7 +61,7 @@ class Candidates(NamedTuple):
 
     def place(self, key: Key) -> Array:
         """[k] a place of a real system that stays where it is."""
-        return jax.random.uniform(key, len(self.real), minval=self.real[:, 0], maxval=self.real[:, 1])
+        return jax.random.uniform(key, (len(self.real),), minval=self.real[:, 0], maxval=self.real[:, 1])
 
     def episode(self, point: Array, key: Key, place: Array | None = None) -> World:
         """Where a simulated episode of a candidate takes place: [k], drawn anew if None. Its sensors are up to twice as
@@ -84,11 +84,15 @@ def draw(unknowns: tuple[Unknown, ...], nominal: Array, key: Key, n: int) -> Arr
     robots do not err in every way at once.
     """
     kinds = np.array([_KINDS.get(u.name, 0) for u in unknowns])
-    key_point, key_anywhere, key_share = jax.random.split(key, 3)
-    size = (n, 1 + max(_KINDS.values()))
-    anywhere = jax.random.bernoulli(key_anywhere, _ANYWHERE, size).at[:, 0].set(True)
-    shares = jnp.where(anywhere, 1.0, jax.random.uniform(key_share, size))[:, kinds]
-    return nominal + shares * (jax.random.uniform(key_point, (n, len(unknowns))) - nominal)
+
+    def one(key: Key) -> Array:
+        key_point, key_anywhere, key_share = jax.random.split(key, 3)
+        size = (1 + max(_KINDS.values()),)
+        anywhere = jax.random.bernoulli(key_anywhere, _ANYWHERE, size).at[0].set(True)
+        shares = jnp.where(anywhere, 1.0, jax.random.uniform(key_share, size))
+        return nominal + shares[kinds] * (jax.random.uniform(key_point, nominal.shape) - nominal)
+
+    return jax.vmap(one)(jax.random.split(key, n))
 
 
 def nominal_of(env: Env) -> Array:
@@ -165,7 +169,8 @@ def candidates(env: Env) -> Candidates:
                 params = params.at[names.index(unknown.name)].set(value)
         return World(Theta(params, exactly(Effects(**effects))), model(params))
 
-    places = (jnp.asarray(box, jnp.float32) for box in (training, ranges[where]))
+    real = np.array([p.real or (p.low, p.high) for p in env.parameters]).reshape(-1, 2)[where]
+    places = (jnp.asarray(box, jnp.float32) for box in (training, real))
     return Candidates(unknowns, nominal_of(env), world, *places)
 
 

@@ -7,7 +7,16 @@ import pytest
 
 import envs
 from envs.base import Parameter
-from sgft_jax.posterior.candidates import Unknown, candidates, point_of, real_range, unknowns_of, values
+from sgft_jax.posterior.candidates import (
+    Unknown,
+    candidates,
+    draw,
+    nominal_of,
+    point_of,
+    real_range,
+    unknowns_of,
+    values,
+)
 
 # Of the tasks whose posteriors are tested. A name that is added after the test's gaps were drawn spoils the test.
 LISTED = {
@@ -81,3 +90,21 @@ def test_a_point_says_the_world():
     np.testing.assert_allclose(effects.obs_bias, [0.0, 0.0, -0.025, 0.0], atol=1e-6)
     np.testing.assert_allclose(effects.action_scale, (0.35 * 1.7) ** 0.5, rtol=1e-5)
     assert jax.tree.all(jax.tree.map(jnp.array_equal, *world.theta.effects))
+
+
+def test_parameters_may_be_anything_and_errors_are_often_small():
+    env = envs.make("hammer", "c")
+    unknowns, nominal = unknowns_of(env), nominal_of(env)
+    numbers = values(unknowns, nominal)
+    assert [float(x) for u, x in zip(unknowns, numbers, strict=True) if u.name == "action_scale"] == [1.0] * 3
+    points = np.asarray(draw(unknowns, nominal, jax.random.key(0), 4000))
+    assert points.min() >= 0 and points.max() <= 1
+    names = np.array([u.name for u in unknowns])
+    assert (points[:, names == "nail_friction"] < 0.1).mean() == pytest.approx(0.1, abs=0.02)
+    # Uniform in half of the systems; in the others a share of the range, uniform too: .1 - .1 log(.1) are below .1.
+    expected = 0.5 * 0.1 + 0.5 * (0.1 - 0.1 * np.log(0.1))
+    assert (points[:, names == "latency"] < 0.1).mean() == pytest.approx(expected, abs=0.02)
+    size = np.abs(points - np.asarray(nominal)).astype(float)
+    together = np.corrcoef(size[:, names == "action_bias"].mean(axis=1), size[:, names == "action_scale"].mean(axis=1))
+    apart = np.corrcoef(size[:, names == "action_bias"].mean(axis=1), size[:, names == "obs_bias"].mean(axis=1))
+    assert together[0, 1] > 0.4 and abs(apart[0, 1]) < 0.1, "commands err together, sensors on their own"
