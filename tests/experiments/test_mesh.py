@@ -22,7 +22,7 @@ from sgft_jax.data import replay
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.train.fleet import make_programs, over_members, spread, spread_replay
-from sgft_jax.train.pretraining import make_trainer, random_experience, training_pools
+from sgft_jax.train.pretraining import domain_of, domains, make_trainer, random_experience, training_pools
 
 LOOP = {"n_envs": 16, "worlds": 8, "chunk_steps": 24, "random_transitions": 64, "random_ladder": 0.5}
 LEARNING = {"replay_capacity": 128, "batch_size": 32, "updates_per_step": 2, "gamma": 0.9}
@@ -45,7 +45,8 @@ def program():
 
 
 def pools():
-    return training_pools(toy.make(), CONFIG, [0])(0)
+    env = toy.make()
+    return training_pools(CONFIG, [0], domain := domain_of(env, CONFIG), env.make_worlds)(0, domains(domain, 1))
 
 
 def agree(one, two, **tolerance):

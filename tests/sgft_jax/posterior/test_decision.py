@@ -39,8 +39,8 @@ def where(point, place):
     return World(Theta(jnp.array([1.0, 0.3]), EffectRange(effects, effects)), {})
 
 
-NOWHERE = jnp.zeros(0)
-SYSTEMS = Candidates((Unknown("action_bias", 0, 0.0, 1.0),), where, NOWHERE, NOWHERE)
+NOWHERE = jnp.zeros((0, 2))
+SYSTEMS = Candidates((Unknown("action_bias", 0, 0.0, 1.0),), jnp.zeros(1), where, NOWHERE, NOWHERE)
 
 
 def choose(particles, acting=(0.0, 0.3, 0.6), noise=0.0):
