@@ -49,6 +49,7 @@ def learned(
     learning, in place of a new one.
     """
     key_play, key_start, key_learn = jax.random.split(jax.random.key(_SEED), 3)
+    cpu = jax.default_backend() == "cpu"
     size, per_call = min(-(-lessons // len(params)), _AT_ONCE), max(1, updates // _TURNS)
     parts, name = -(-lessons // size), simulators[0].env.name
     start = jax.jit(begin if former is None else lambda key, lessons: resume(former))
@@ -72,7 +73,7 @@ def learned(
                 far((i + 1) / parts)
             seen = join(jax.device_get(taught))  # from two devices
         count = -(-updates // per_call)
-        with doing(f"learning which systems of {name} make which rollouts", 100):
+        with doing(f"learning which systems of {name} make which rollouts", 10 * updates if cpu else 100):
             learning = start(key_start, seen)
             ahead.wait(*steps.values())
             for i in range(count):
@@ -80,7 +81,7 @@ def learned(
                     learning = step(learning, seen, jax.random.fold_in(jax.random.fold_in(key_learn, i), n))
                 jax.block_until_ready(learning)
                 far((i + 1) / count)
-        with doing(f"checking how sure of systems of {name} it may be", 60):
+        with doing(f"checking how sure of systems of {name} it may be", 240 if cpu else 60):
             key_fresh, key_test = jax.random.split(jax.random.fold_in(key_play, parts))
             others = functools.partial(_others, simulators, policy, params)
             complete = jax.jit(finish)(learning.estimator, others(key_fresh, min(lessons, _FRESH)), key_fresh)
