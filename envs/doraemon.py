@@ -104,7 +104,7 @@ Valued = Callable[[np.ndarray], tuple[float, np.ndarray]]  # numbers a, b [2 d] 
 def _most(goal: Valued, start: np.ndarray, constraints: Sequence[optimize.NonlinearConstraint]) -> np.ndarray:
     """[2 d] where a goal is largest, beginning at `start`."""
     bounds = optimize.Bounds(1.0, _CONCENTRATION)
-    found = optimize.minimize(
+    result = optimize.minimize(
         lambda x: -goal(x)[0],
         start,
         jac=lambda x: -goal(x)[1],
@@ -113,12 +113,12 @@ def _most(goal: Valued, start: np.ndarray, constraints: Sequence[optimize.Nonlin
         method="trust-constr",
         options={"gtol": 1e-4, "xtol": 1e-6, "maxiter": 300},
     )
-    return np.clip(found.x, 1.0, _CONCENTRATION)
+    return np.clip(result.x, 1.0, _CONCENTRATION)
 
 
 def _within(function: Valued, low: float, high: float) -> optimize.NonlinearConstraint:
-    slope: Any = lambda x: function(x)[1]  # noqa: E731  SciPy's types know names of rules alone
-    return optimize.NonlinearConstraint(lambda x: function(x)[0], low, high, jac=slope)
+    slope: dict[str, Any] = {"jac": lambda x: function(x)[1]}  # SciPy's types know names of rules alone
+    return optimize.NonlinearConstraint(lambda x: function(x)[0], low, high, **slope)
 
 
 def _betas(x: np.ndarray) -> Betas:

@@ -86,6 +86,8 @@ def check(args: PretrainArgs) -> list[int]:
     seeds, real = seed_list(args.seed, args.seeds), args.real not in (None, SIM)
     if args.set and not real:
         raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")
+    if real and args.config.doraemon:
+        raise UserError(f"--real {args.real}: has a domain of its own; leave doraemon off")
     not_negative(args, "devices")
     check_task(args.task, [str(args.real)] if real else [], args.set)
     if args.hosts not in (None, "auto"):

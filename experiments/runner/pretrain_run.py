@@ -18,7 +18,7 @@ import numpy as np
 
 import envs
 from envs import gaps, mesh
-from envs.base import Env, World
+from envs.base import Domain, Env, World
 from envs.domains import uniform, with_actuators
 from envs.doraemon import entropy
 from envs.gaps import SIM, Gap
@@ -89,6 +89,7 @@ def run(args: "PretrainArgs", seeds: list[int], home: Path) -> dict[str, Any]:
     if args.config.blind_actor:
         network = replace(args.config.network, blind=len(env.system))
         args = replace(args, config=replace(args.config, network=network))
+    domain = pretraining.domain_of(env, args.config)
     sizes = pretraining.memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     with folder_of_host(home) as folder, mesh.use(devices):
@@ -96,7 +97,7 @@ def run(args: "PretrainArgs", seeds: list[int], home: Path) -> dict[str, Any]:
         with opened("pretrain", args, {folder: jsonable(args)}) as (folder,):
             mesh.meet()  # nobody looks for checkpoints before the first host has emptied a folder to be replaced
             record = Record(folder, {"kind": "pretrain", "task": env.name, "seeds": seeds}, home)
-            return _Run(args, env, gap, record).work()
+            return _Run(args, env, gap, domain, record).work()
 
 
 class _Writer:
@@ -132,7 +133,7 @@ class _Run(Training):
 
     unit = "env steps"
 
-    def __init__(self, args: "PretrainArgs", env: Env, gap: Gap | None, record: Record) -> None:
+    def __init__(self, args: "PretrainArgs", env: Env, gap: Gap | None, domain: Domain, record: Record) -> None:
         self.args, self.config, self.env, self.gap = args, args.config, env, gap
         self.records, self.record, self.seeds = [record], record, record.seeds
         size = self.config.chunk_env_steps
@@ -142,8 +143,8 @@ class _Run(Training):
         self.fits = recipe_of(env, self.config).valued
         self.card = pretraining.prior_card(env, self.config) | (pretraining.system_card(system) if self.fits else {})
         self.policy = make_policy(self.card, env)
-        self.domain, self.make = pretraining.domain_of(env, self.config), pretraining.maker(env, self.config)
-        self.widening = pretraining.training_pools(self.config, self.seeds, self.domain, self.make)
+        self.domain, self.make = domain, pretraining.maker(env, self.config)
+        self.widening = pretraining.training_pools(self.config, self.seeds, domain, self.make)
         self.whole = functools.lru_cache(maxsize=1)(self._whole)  # worlds take long to compile
         self.shapes = functools.cache(self._shapes)
         self.programs = pretraining.make_programs(env, self.config, len(self.seeds))

@@ -19,6 +19,8 @@ ROWS = [
     ("pretrain --real nope", "gap of push: there is no 'nope'"),
     ("pretrain --real " + 300 * "x", "gap of push: there is no "),
     ("pretrain --set latency=0.1", "--set latency=0.1: changes a real system"),
+    ("pretrain --config.doraemon", "option doraemon is True: must be off where refresh-every is 0"),
+    ("pretrain --preset doraemon --real default", "--real default: has a domain of its own; leave doraemon off"),
     ("pretrain --real default --set latency", "'latency' does not set anything"),
     ("pretrain --real default --set latency=", "'latency=' does not set anything"),
     ("pretrain --real default --set =1", "'=1' does not set anything"),
