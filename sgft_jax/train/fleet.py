@@ -232,9 +232,8 @@ def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None
 
 def spread(state: FleetState) -> FleetState:
     """Environments and experience in pieces on the devices of a mesh, the agent whole on each of them."""
-    pieces = state._replace(replay=spread_replay(state.replay), fleet=split(state.fleet))
-    alone = (whole(x) for x in (state.learner, state.key, state.rounds, state.domain))
-    return pieces._replace(**dict(zip(("learner", "key", "rounds", "domain"), alone, strict=True)))
+    pieces = state._replace(replay=spread_replay(state.replay), fleet=split(state.fleet), domain=whole(state.domain))
+    return pieces._replace(learner=whole(state.learner), key=whole(state.key), rounds=whole(state.rounds))
 
 
 def spread_replay(experience: PyTree) -> PyTree:
